@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults operator bench peers plant reloads clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -93,6 +93,10 @@ mutants: .venv/ready
 # Faults as an operator meets them, and what each place says of them (docs/operator.md).
 operator: .venv/ready
 	$(BIN)/python -m tests.faults.operator
+
+# Writes with faults, checked against what the PLC did.
+histories: .venv/ready
+	$(BIN)/python -m tests.faults.histories
 
 faults: .venv/ready
 	RESTARTS=200 $(BIN)/python -m pytest -q tests/faults

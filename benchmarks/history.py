@@ -76,21 +76,27 @@ def cpu() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
+def written() -> int:
+    """Returns the bytes that this process has given to the disk."""
+    found = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
+    return int(found["write_bytes"])
+
+
 def insert(folder: Path, count: int, rate: float, seconds: float) -> None:
     path = folder / f"{count}-{rate:.0f}.db"
     historian = Historian(path, 7 * 86400.0, GIGABYTE)
     historian.start()
     some = tags(count)
-    begun, used = time.perf_counter(), cpu()
+    begun, used, wrote = time.perf_counter(), cpu(), written()
     late = sorted(asyncio.run(record(historian, some, rate, seconds)))
     assert historian.close(60)
-    took, used = time.perf_counter() - begun, cpu() - used
+    took, used, wrote = time.perf_counter() - begun, cpu() - used, written() - wrote
     document = historian.document()
     stored = document["stored"]
     assert isinstance(stored, int)
     print(
         f"{count:7} {rate or 'all':>8} {stored / took:11,.0f} {document['lost']:6} "
-        f"{used / took:6.0%} {path.stat().st_size / stored:7.1f} "
+        f"{used / took:6.0%} {path.stat().st_size / stored:7.1f} {wrote / stored:7.1f} "
         f"{late[len(late) // 2] * 1e3:6.2f} {late[len(late) * 99 // 100] * 1e3:6.2f} "
         f"{late[-1] * 1e3:6.1f}"
     )
@@ -142,16 +148,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--tags", nargs="*", type=int, default=[100, 5_000, 50_000])
+    parser.add_argument(
+        "--rates", nargs="*", type=float, default=[10_000.0, 50_000.0, 0.0], help="samples a second"
+    )
     parser.add_argument("--folder", type=Path, help="a folder on the disk to be measured")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
         print("recording; stalls of the event loop in ms")
         print(
             f"{'tags':>7} {'offered':>8} {'stored/s':>11} {'lost':>6} {'CPU':>6} {'bytes':>7} "
-            f"{'p50':>6} {'p99':>6} {'max':>6}"
+            f"{'written':>7} {'p50':>6} {'p99':>6} {'max':>6}"
         )
         for count in given.tags:
-            for rate in (10_000.0, 50_000.0, 0.0):
+            for rate in given.rates:
                 insert(Path(folder), count, rate, given.seconds)
         print("asking one tag; ms for each question, MB by which the process grew meanwhile")
         print(f"{'tags':>7} {'in file':>9} {'range':>7} {'found':>9} {'ms':>9} {'samples/s':>12} "

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any, TypeVar
 
+from gateway.engine.jobs.jobs import Traffic
 from gateway.errors import Garbled, NoReply
 from gateway.protocols.driver import AnyDriver, Cost
 
@@ -64,7 +65,7 @@ class Wire:
     `bounded`: no more bytes may come back than the driver announced.
     """
 
-    may_echo = False
+    may_echo = may_begin_to_echo = False
 
     def __init__(
         self,
@@ -78,6 +79,7 @@ class Wire:
         self.sent: list[bytes] = []
         self.received: list[bytes] = []
         self.replies: list[int] = []  # the reply lengths the driver announced
+        self.traffic = Traffic()
 
     def guard(self, since: float | None) -> None:
         """Nothing is refused here."""
@@ -91,7 +93,13 @@ class Wire:
         self.sent.append(self._codec.encode(frame))
         self._respond(self.sent[-1])
 
-    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+    async def ask(
+        self,
+        frame: Any,
+        reply: int,
+        answers: Callable[[Any], T | None],
+        within: float | None = None,
+    ) -> T:
         self.sent.append(self._codec.encode(frame))
         self.replies.append(reply)
         pieces = list(self._respond(self.sent[-1]))

@@ -22,7 +22,7 @@ def control(
     loaded = load(config)
     check_command(loaded, device, command)
     if without_gateway:
-        from gateway.cli import direct
+        from gateway.cli.line import direct
 
         print(direct.run(direct.control(loaded, device, command, argument)).answer)
         return

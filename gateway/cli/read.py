@@ -30,7 +30,7 @@ def read(
     if max_age is not None:
         parse_max_age(max_age)  # reports a mistake even when no gateway runs
     if without_gateway:
-        from gateway.cli import direct
+        from gateway.cli.line import direct
 
         chosen = [tag for key, tag in by_key.items() if matches(key, wanted)]
         samples = direct.run(direct.read(loaded, chosen))

@@ -15,8 +15,8 @@ import structlog
 import typer
 
 from gateway import __version__
-from gateway.cli.check import size
-from gateway.cli.logs import LogFormat, LogLevel, set_up
+from gateway.cli.config.check import size
+from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, err
 from gateway.config import Config, load

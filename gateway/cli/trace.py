@@ -9,12 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from gateway.cli.capture import Capture
 from gateway.cli.client import connected
-from gateway.cli.recording import Recording
+from gateway.cli.line.capture import Capture
+from gateway.cli.line.recording import Recording
 from gateway.cli.terminal import AsJson, ConfigPath, err, printable
-from gateway.config import Config, LineConfig, load, parsers
+from gateway.config import Config, LineConfig, load
 from gateway.config.messages import meant
+from gateway.config.settings import parsers
 from gateway.errors import ConfigError
 from gateway.parts.recording.wire_file import event_lines
 

@@ -119,7 +119,7 @@ def _write_group(
     if not directly:
         with connected(config, err.print) as client:
             return client.write(device, dict(values))
-    from gateway.cli import direct
+    from gateway.cli.line import direct
 
     tags = [(known[f"{device}/{name}"], value) for name, value in values.items()]
     started = time.monotonic()
@@ -156,7 +156,7 @@ def _parsed(text: str, tag: Tag) -> Value:
 
 def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]:
     """Writes without a gateway. Returns the outcome in the words of a gateway."""
-    from gateway.cli import direct
+    from gateway.cli.line import direct
 
     try:
         return _decoded(payload.outcome(direct.run(direct.write(config, tag, value))))

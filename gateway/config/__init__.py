@@ -7,18 +7,24 @@ if TYPE_CHECKING:
     from gateway.config.json_schema import schema
     from gateway.config.loading import built, expanded_text, load, state_folder
     from gateway.config.messages import ConfigErrors
-    from gateway.config.records import AlarmsConfig, Config, HistoryConfig, LineConfig, WebConfig
-    from gateway.config.sheet_tags import SheetUse
-    from gateway.config.zenoh_records import TlsConfig, ZenohConfig, ZenohMode
+    from gateway.config.settings.records import (
+        AlarmsConfig,
+        Config,
+        HistoryConfig,
+        LineConfig,
+        WebConfig,
+    )
+    from gateway.config.settings.zenoh_records import TlsConfig, ZenohConfig, ZenohMode
+    from gateway.config.sheets.tags import SheetUse
 else:
     # Each is imported when it is used: a client of a running gateway needs few of them.
     _MODULES = {
         "json_schema": ("schema",),
         "loading": ("built", "expanded_text", "load", "state_folder"),
         "messages": ("ConfigErrors",),
-        "records": ("AlarmsConfig", "Config", "HistoryConfig", "LineConfig", "WebConfig"),
-        "sheet_tags": ("SheetUse",),
-        "zenoh_records": ("TlsConfig", "ZenohConfig", "ZenohMode"),
+        "settings.records": ("AlarmsConfig", "Config", "HistoryConfig", "LineConfig", "WebConfig"),
+        "sheets.tags": ("SheetUse",),
+        "settings.zenoh_records": ("TlsConfig", "ZenohConfig", "ZenohMode"),
     }
     _PLACES = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -6,12 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gateway.config import parsers
 from gateway.config.messages import Mistakes, OptionPlaces
-from gateway.config.session_files import with_files
-from gateway.config.yaml_events import first_sections
-from gateway.config.yaml_file import TEXTS, file_text
-from gateway.config.zenoh_records import LISTEN, NAME, TlsConfig, ZenohConfig, ZenohMode
+from gateway.config.settings import parsers
+from gateway.config.settings.session_files import with_files
+from gateway.config.settings.zenoh_records import LISTEN, NAME, TlsConfig, ZenohConfig, ZenohMode
+from gateway.config.yaml.events import first_sections
+from gateway.config.yaml.file import TEXTS, file_text
 from gateway.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -6,45 +6,45 @@ from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
-from gateway.config import parsers
-from gateway.config.array_rules import check_overlaps
-from gateway.config.computed_tags import check_totals, with_computed
-from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire, modem_of
 from gateway.config.messages import Mistakes, Path, meant, shown
-from gateway.config.model import (
+from gateway.config.settings import parsers
+from gateway.config.settings.model import (
     DeviceSection,
     FileSection,
     LineSection,
-    TagDefaults,
 )
-from gateway.config.records import (
+from gateway.config.settings.records import (
     AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
     WebConfig,
 )
-from gateway.config.served import (
-    ServedDevice,
-    ServedView,
-    check_retained,
-    check_served_line,
-    check_sources,
-    only_served,
-    until_the_next_call,
-)
-from gateway.config.session_files import existing_file, with_files
-from gateway.config.sheet_tags import SheetTags
-from gateway.config.tag_rules import inherit
-from gateway.config.transfers import TransferRows
-from gateway.config.validate import (
+from gateway.config.settings.session_files import existing_file, with_files
+from gateway.config.settings.validate import (
     driver_of,
     driver_settings,
     protocols,
     section,
     unknown,
 )
+from gateway.config.sheets.tags import SheetTags
+from gateway.config.tags.arrays import check_overlaps
+from gateway.config.tags.computed import check_totals, with_computed
+from gateway.config.tags.device_tags import DeviceTags, mapping
+from gateway.config.tags.section import TagDefaults, inherit
+from gateway.config.tags.served import (
+    ServedDevice,
+    ServedView,
+    check_retained,
+    check_served_line,
+    check_sources,
+    only_served,
+    request_gap,
+    until_the_next_call,
+)
+from gateway.config.transfers.rows import TransferRows
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
@@ -163,6 +163,7 @@ class Builder:
             modem=modem,
             listen_only=line.listen_only,
             serve=line.serve,
+            request_gap=request_gap(line, dials=modem is not None),
             devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
         )
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gateway.config.records import Config, LineConfig
+from gateway.config.settings.records import Config, LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.tags import Tag
 
@@ -131,7 +131,7 @@ def _alike(one: Any, other: Any) -> bool:
 def _changed(old: Any, new: Any, prefix: str, left_out: set[str]) -> Iterator[str]:
     for one in fields(old):
         before, after = getattr(old, one.name), getattr(new, one.name)
-        if one.name in left_out or before == after:
+        if one.name in left_out or before == after or not one.init:
             continue
         name = prefix + _NAMES.get(one.name, one.name)
         if is_dataclass(before) and is_dataclass(after):

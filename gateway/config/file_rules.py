@@ -5,7 +5,7 @@ from pathlib import Path as FilePath
 
 from gateway import files
 from gateway.config.messages import Mistakes, Path
-from gateway.config.records import Config
+from gateway.config.settings.records import Config
 
 _HISTORY = ("", "-wal", "-shm", "-journal", ".lock")  # SQLite's files, and the lock
 _STATE = ("", ".new", ".bad")

@@ -8,23 +8,22 @@ from typing import Any, get_type_hints
 
 from pydantic import BaseModel, TypeAdapter
 
-from gateway.config.driver_settings import dataclasses_in, is_duration
-from gateway.config.model import (
+from gateway.config.settings.driver_settings import dataclasses_in, is_duration
+from gateway.config.settings.model import (
     DeviceSection,
     FileSection,
     LineSection,
-    TagDefaults,
-    TagSection,
 )
-from gateway.config.parsers import BYTES, SECONDS
-from gateway.config.session_model import Section
-from gateway.config.setting_types import (
+from gateway.config.settings.parsers import BYTES, SECONDS
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import (
     DURATION_SCHEMA,
     INTERVAL_SCHEMA,
     NAME_PATTERN,
     TAG_NAME_PATTERN,
 )
-from gateway.config.transfer_settings import TransferSection
+from gateway.config.tags.section import TagDefaults, TagSection
+from gateway.config.transfers.settings import TransferSection
 from gateway.errors import ConfigError
 from gateway.protocols.registry import PROTOCOLS
 

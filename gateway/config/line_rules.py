@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import LineSection
-from gateway.config.modem_settings import ModemSection
+from gateway.config.settings.model import LineSection
+from gateway.config.settings.modem_settings import ModemSection
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
 from gateway.protocols.capabilities import EchoConflict
@@ -27,6 +27,9 @@ def check_line(
     _check_stations(devices, path, mistakes)
     if line.format is not None:
         _check_format(line.format, devices, (*path, "format"), mistakes)
+    if line.request_gap is not None and not line.serve:
+        text = "request_gap is a setting of served lines: this line has no `serve: true`"
+        mistakes.add((*path, "request_gap"), text)
     if line.listen_only:
         _check_listening(line, devices, path, mistakes)
     for device in devices:

@@ -10,10 +10,10 @@ from pathlib import Path
 from gateway.config.build import Builder
 from gateway.config.file_rules import check_files
 from gateway.config.messages import Mistakes, OptionPlaces
-from gateway.config.records import Config
-from gateway.config.templates import expanded
-from gateway.config.yaml_dump import dumped
-from gateway.config.yaml_file import TEXTS, read_yaml
+from gateway.config.settings.records import Config
+from gateway.config.templates.expand import expanded
+from gateway.config.yaml.dump import dumped
+from gateway.config.yaml.file import TEXTS, read_yaml
 
 STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
 

@@ -35,6 +35,8 @@ def faults(documents: Documents) -> Iterator[str]:
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
+    if aside := history.get("aside"):
+        yield f"history: {aside[0]} was moved aside: see `plc-gateway history salvage` and `known`"
 
 
 def _of_parts(documents: Documents) -> Iterator[str]:

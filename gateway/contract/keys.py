@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from gateway.config import parsers
+from gateway.config.settings import parsers
 from gateway.errors import BadValue, ConfigError
 
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?)(ms|s|min|m|h|d|)\Z")

@@ -6,6 +6,7 @@ No message here shows the content of a file.
 import os
 import re
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 
 from gateway import files
@@ -63,10 +64,10 @@ def plant_secret(file: Path | None) -> str | None:
     return found
 
 
-def check_users(path: Path) -> None:
-    """Raises `ConfigError` for a file that Zenoh would refuse, or without any user: Zenoh would
-    then accept every connection."""
-    named = False
+def users(path: Path) -> Mapping[str, str]:
+    """Returns the passwords by user. Raises `ConfigError` for a file that Zenoh would refuse, or
+    without any user: Zenoh would then accept every connection."""
+    found = dict[str, str]()
     for number, line in enumerate(readable_secret(path, "zenoh.users_file").splitlines(), 1):
         name, _, password = line.partition(":")
         if line.strip():
@@ -74,11 +75,12 @@ def check_users(path: Path) -> None:
                 raise ConfigError(
                     f"zenoh.users_file {path}, line {number}: write it as name:password"
                 )
-            named = True
-    if not named:
+            found[name.strip()] = password.strip()
+    if not found:
         raise ConfigError(
             f"zenoh.users_file {path} names no user, so the gateway would accept every connection"
         )
+    return found
 
 
 def holds_secret(zenoh_file: str) -> bool:

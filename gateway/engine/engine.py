@@ -19,6 +19,7 @@ from gateway.engine.jobs.jobs import (
     Poll,
     PolledBlock,
     Probe,
+    Reopen,
     Result,
     Traffic,
     Transacted,
@@ -28,14 +29,13 @@ from gateway.engine.jobs.jobs import (
 from gateway.engine.jobs.requests import Request, Write, why_not_commanded
 from gateway.engine.jobs.unanswered import Unanswered
 from gateway.engine.results.health_rules import HealthRules, offline
-from gateway.engine.results.listening import ONLY_LISTENS, Listening, listens
+from gateway.engine.results.listening import ONLY_LISTENS, listens
 from gateway.engine.results.next_job import NextJob
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.request_rules import RequestRules
-from gateway.engine.results.shorter_silences import ShorterSilences
-from gateway.engine.results.staleness import NEVER, Staleness
-from gateway.engine.results.stray import Stray
-from gateway.engine.results.unsolicited import UnsolicitedFrames
+from gateway.engine.results.rule import NEVER, Rules
+from gateway.engine.results.staleness import Staleness
+from gateway.engine.rules import LineState, rules_of
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
@@ -60,55 +60,43 @@ class Engine:
         self.deadline = NEVER  # when `expire` must be called
         self.schedule = Schedule(devices, 0.0, seed)
         self.name, self.wire = name, wire
-        self._effects = Effects()
-        self._staleness = Staleness(self.schedule, self._effects)
-        results = HealthRules(name, self.schedule, self._staleness, self._effects)
-        self._polls = PollRules(self.schedule, results, self._effects)
-        self._unsolicited: UnsolicitedFrames | Listening
-        if listens(devices):
-            self._unsolicited = Listening(devices, wire, results, self._effects)
-        else:
-            self._unsolicited = UnsolicitedFrames(devices, results, self._effects)
-        self._stray = Stray(name, devices, results, self._effects)
-        self._in_flight = InFlight()
+        self._effects = effects = Effects()
+        self._in_flight = in_flight = InFlight()
+        staleness = Staleness(self.schedule, effects)
+        health = HealthRules(name, self.schedule, staleness, effects)
+        self._polls = PollRules(self.schedule, health, effects)
+        requests = RequestRules(self.schedule, health, effects)
         gap = max(GAP, 4 * wire.character)
-        requests = RequestRules(self.schedule, results, self._effects)
-        self._next_job = NextJob(
-            *(self._in_flight, results, self._polls, requests),
-            *(ShorterSilences(name, devices, self._effects), self._effects, gap),
-        )
+        self._next_job = NextJob(in_flight, health, self._polls, requests, effects, gap)
+        shared = (self.record, self.schedule, in_flight, staleness, health, effects)
+        self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
+        self._listens = listens(devices)
+        self._replies = 0  # of all stations, until the port was opened
 
     # The cycle of the line
 
     def next(self, now: float) -> Job:
         """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
-        shorter = self._next_job.shorter
-        if shorter.suspects:
-            shorter.judge(now)
-        job, in_flight = self._next(now), self._in_flight
-        if shorter.step:
-            shorter.before(job, in_flight.open.get(job) if isinstance(job, Poll) else None)
+        job = self._next(now)
+        for before in self.rules.before:
+            before(job, now)
         return job
 
     def _next(self, now: float) -> Job:
-        in_flight = self._in_flight
+        in_flight, rules = self._in_flight, self.rules
         if in_flight.continuation is not None:
             return in_flight.resume(now)
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
-        silence = self._next_job.silence
-        may_reopen = silence.noted and not self.schedule.reaches_by_modem
-        if may_reopen and silence.due <= now and silence.confirmed(self.schedule, self.devices):
-            return silence.reopen(now)
-        job: Transacted | PollEntry | Idle | None = None
-        if self._unsolicited.speakers:
-            job = self._unsolicited.next(now)
+        job: Transacted | PollEntry | Idle | Reopen | None = rules.preceding(now)
         if job is None:
-            job = self.schedule.next(now)
+            job = self.schedule.next(now, rules.free_at if rules.free else None)
         if isinstance(job, PollEntry):
             return in_flight.begin_poll(job, now)
+        if isinstance(job, Reopen):
+            return job
         if isinstance(job, Idle):
-            return Idle(silence.due) if may_reopen and now < silence.due < job.until else job
+            return Idle(min([job.until, *(wake(now) for wake in rules.wake)]))
         if type(job) is Write and (shared := self.schedule.requests.companions(job)):
             job = WriteTogether(job.device, shared.writes, shared.run)
         if job.device.shapes is not None:
@@ -121,7 +109,7 @@ class Engine:
 
         They share the transaction of `poll`; each is concluded by itself.
         """
-        most = self._next_job.pipelining.others(poll, now)
+        most = min((beside(poll, now) for beside in self.rules.beside), default=0)
         others = self.schedule.alongside(poll.device, most, now)
         return [self._in_flight.begin_beside(other) for other in others]
 
@@ -130,33 +118,26 @@ class Engine:
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
-        self._next_job.shorter.concluded(job, result, traffic, now)
+        for concluded in self.rules.concluded:
+            concluded(job, result, traffic, now, time)
         self._count(device, traffic, now)
         if isinstance(job, Poll):
             entry = in_flight.open.pop(job)
             if isinstance(result, Exception):
                 self._next_job.poll_failed(entry, result, now, time)
             else:  # units are the only good result of a poll
-                if self._next_job.silence.noted:
-                    self._next_job.silence.heard()
                 self._polls.read(entry, cast("Sequence[int]", result), now, time)
             if in_flight.open:
                 return self._effects.take()
-            if in_flight.failed or device.window > 1:
-                self._next_job.polls_ended(job, traffic, now, time)
+            if in_flight.failed:
+                self._next_job.polls_ended(traffic, now, time)
         else:
             self._next_job.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:
-            in_flight.job = None
-            in_flight.failed.clear()
-            if in_flight.charged is not None and len(self.devices) > 1:
-                in_flight.charged.used(now, in_flight.begun)
-        if self._unsolicited.speakers:
-            self._unsolicited.transaction_ended(device, now, sent=traffic.sent, heard=traffic.heard)
+            in_flight.ended(now, shared=len(self.devices) > 1)
+        effects = self._effects.take()
+        if len(effects) != 1 or self.deadline <= now:  # a good read alone changes no deadline
             self._set_deadline()
-        elif self._staleness.due < self.deadline or not isinstance(job, Poll):
-            self._set_deadline()
-        effects, self._effects.collected = self._effects.collected, []
         return effects
 
     def _count(self, device: Device, traffic: Traffic, now: float) -> None:
@@ -165,6 +146,14 @@ class Engine:
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if device.shapes is not None:
             device.shapes.at = now
+
+    @property
+    def was_answered(self) -> bool:
+        """True if a station replied since the port was opened: it is worth opening at once."""
+        return self._count_replies() > self._replies
+
+    def _count_replies(self) -> int:
+        return sum(device.record.exchanges + device.record.heard for device in self.devices)
 
     @property
     def is_idle(self) -> bool:
@@ -236,15 +225,12 @@ class Engine:
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
-        if isinstance(self._unsolicited, Listening):
+        if self._listens:
             self.record.count(len(data) * self.wire.character, 0.0)  # of another master
         else:
             self.record.count_unasked(len(data))
-            self._next_job.shorter.disturbed(now)
-            self._stray.received(data, now, time)
-        if self._unsolicited.speakers:
-            self._next_job.silence.heard()
-        self._unsolicited.received(data, now, time)
+        for received in self.rules.received:
+            received(data, now, time)
         self._set_deadline()
         return self._effects.take()
 
@@ -255,11 +241,8 @@ class Engine:
 
         `echo`: it is equal to the request.
         """
-        if not echo:
-            self._next_job.silence.heard()
-            self._next_job.shorter.disturbed(now)
-        self._stray.unmatched(device, frame, now, time, echo=echo)
-        self._unsolicited.unmatched(device, frame, now, time)
+        for unmatched in self.rules.unmatched:
+            unmatched(device, frame, now, time, echo=echo)
         self._set_deadline()
         return self._effects.take()
 
@@ -275,24 +258,18 @@ class Engine:
             new.take_over(old)
         self.devices[:] = changes.applied(self.devices)
         self.schedule.change(changes, now)
-        self._staleness.change(changes, now, is_open=self.is_open)
-        self._unsolicited.change(changes, now)
-        self._stray.change(changes)
-        self._next_job.change(changes, now)
+        for device in changes.added:  # its station may be that of a device before
+            device.health.inherit()
+        self.rules.change(changes, now, is_open=self.is_open)
         self._polls.change(changes)
         self._set_deadline()
         return self._effects.take()
 
     def expire(self, now: float, time: int) -> list[Effect]:
         """Ends requests that waited too long, and turns old values bad. Called at `deadline`."""
-        for request in self.schedule.requests.expired(now):
-            waited = f"waited {now - request.submitted:.1f} s for the line"
-            refused = isinstance(request, Write) and request.alone
-            sent = "refused together with others, and not sent alone" if refused else "not sent"
-            self._effects.ended(request, Busy(f"{waited}; {sent}"))
-        if self._staleness.due <= now:
-            self._staleness.look(now, time)
-        self._unsolicited.tick(now, time)
+        for rule in self.rules.timed:
+            if rule.due <= now:
+                rule.tick(now, time)
         self._set_deadline()
         return self._effects.take()
 
@@ -303,14 +280,13 @@ class Engine:
     def opened(self, now: float) -> list[Effect]:
         """Starts all devices again, because the port was opened."""
         self.is_open = True
+        self._replies = self._count_replies()
         self.record.open(now)
         self._in_flight.clear()
-        self._next_job.silence.opened()
-        self._next_job.shorter.opened(now)
         for device in self.devices:
             device.restart()
         self.schedule.opened(now)
-        self._unsolicited.opened(now)
+        self.rules.opened(now)
         self._set_deadline()
         return self._effects.take()
 
@@ -332,16 +308,11 @@ class Engine:
 
     def _close(self, why: str = " went down") -> list[Effect]:
         self.is_open = False
-        self._staleness.stop()
+        self.rules.closed()
         for request in self.schedule.requests.withdraw():
             self._effects.ended(request, LineDown(f"line {self.name}{why}; not sent"))
         self._set_deadline()
         return self._effects.take()
 
     def _set_deadline(self) -> None:
-        deadline = self._staleness.due
-        for request in self.schedule.requests.waiting:
-            deadline = min(deadline, request.expires)
-        if self._unsolicited.speakers:
-            deadline = min(deadline, self._unsolicited.due)
-        self.deadline = deadline
+        self.deadline = min([rule.due for rule in self.rules.timed], default=NEVER)

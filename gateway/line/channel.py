@@ -71,7 +71,16 @@ class Echo:
     replies show if the adapter echoes.
     """
 
-    __slots__ = ("_early", "_line", "_logged", "_pending", "_setting", "found", "strip")
+    __slots__ = (
+        "_early",
+        "_line",
+        "_logged",
+        "_pending",
+        "_setting",
+        "absent_at",
+        "found",
+        "strip",
+    )
 
     def __init__(self, line: str, setting: bool | None) -> None:
         """`setting`: of the file; None: not set."""
@@ -84,11 +93,17 @@ class Echo:
     def opened(self) -> None:
         """Starts again: the port was opened, perhaps with another adapter."""
         self.found = self._setting  # None: not yet known
+        self.absent_at = -NEVER  # when a reply came without an echo last
         self._pending = b""  # the part of the echo that must still arrive
         self._early = b""  # bytes that arrived before the echo
 
     def sent(self, data: bytes) -> None:
         self._pending, self._early = data, b""
+
+    @property
+    def absent_by_evidence(self) -> bool:
+        """True if replies showed that there is no echo; it may begin later."""
+        return self.found is False and self._setting is None
 
     @property
     def early(self) -> bytes:

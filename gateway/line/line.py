@@ -198,18 +198,19 @@ class Line:
         """Serves the line until cancelled. Its errors do not end other lines."""
         pause = REOPEN_FIRST
         while True:
-            served = 0.0
+            served, answered = 0.0, False
             try:
                 why = await self._open_and_serve()
                 if self.engine.is_open:
                     served = _now() - self.engine.record.since
+                    answered = self.engine.was_answered
                 self.deliver(self.engine.lost(LineDown(why), _now(), self._wall()))
                 self.tried.set()
             finally:
                 self.deliver(self.engine.stopped(_now()))
                 self._apply()
                 await self._close()  # last, because closing can be slow
-            if served > REOPEN_LONGEST:
+            if served > REOPEN_LONGEST or answered:
                 pause = REOPEN_FIRST
             await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.device.long_writes import LongWrite
 from gateway.engine.jobs.jobs import (
     Answer,
@@ -45,15 +46,17 @@ DIFFER = "two readings in a row differ; verify_reads is for values that change s
 
 
 @dataclass(frozen=True, slots=True)
-class ShortTalk:
-    """The `Talk` of a short probe, which waits less than `reply_timeout`."""
+class ProbeTalk:
+    """The `Talk` of a probe. A short one waits less than `reply_timeout`."""
 
     transaction: Transaction
-    timeout: float
+    timeout: float | None
+    online: bool  # its device replied to the last request
 
     @property
     def may_echo(self) -> bool:
-        return self.transaction.may_echo
+        """While the device was silent, an adapter may have begun to echo."""
+        return self.transaction.may_begin_to_echo if not self.online else self.transaction.may_echo
 
     async def tell(self, frame: Any) -> None:
         await self.transaction.tell(frame)
@@ -87,7 +90,7 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             return await transaction.settle(guard, gap)
         case Probe(outstanding=outstanding, token=token, timeout=timeout):
             spans = job.device.probe_spans
-            talk = transaction if timeout is None else ShortTalk(transaction, timeout)
+            talk = ProbeTalk(transaction, timeout, job.device.state is State.ONLINE)
             return Resynced(await driver.resync(talk, outstanding, token, spans))
         case Write() | Repeat():
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)
@@ -236,8 +239,11 @@ async def _only_reply(
         refused, acknowledged = error, False
     finally:
         talk.guard(None)
-    if write.resyncs.after is not None:
-        await _prove_only_reply(write, run or write.tag.span, write.resyncs.after, talk)
+    token = write.resyncs.after
+    if token is None and talk.traffic.doubtful:
+        token = write.resyncs.spare
+    if token is not None:
+        await _prove_only_reply(write, run or write.tag.span, token, talk)
     if refused is not None:
         raise refused
     return acknowledged

@@ -26,6 +26,7 @@ class _Request:
     future: "asyncio.Future[Any]"
     sent: float  # by the line's clock
     heard: int = 0  # characters of its reply
+    equal: bool = False  # its reply was equal to it
 
 
 @dataclass(slots=True, eq=False)
@@ -94,6 +95,11 @@ class Transaction:
         echo = self._channel.echo
         return not echo.strip and echo.found is not False
 
+    @property
+    def may_begin_to_echo(self) -> bool:
+        """As `may_echo`, if an echo may begin that replies did not show before."""
+        return self.may_echo or self._channel.echo.absent_by_evidence
+
     def guard(self, since: float | None) -> None:
         """Marks the next frame as the write of a client, submitted at `since`; None: it is not.
 
@@ -160,6 +166,9 @@ class Transaction:
         traffic = self.traffic
         traffic.exchanges += 1
         own = self._answered - alone - busy
+        if request.equal:
+            unproven = started - channel.echo.absent_at
+            self.traffic.doubtful = device.may_be_echo(own, unproven)
         if own > 0.0:
             traffic.turnaround += own
         return answer
@@ -257,9 +266,7 @@ class Transaction:
                 _fail(request, error)
                 return
             if answer is not None:
-                echo = self._channel.echo
-                if not echo.strip and (echo.found is not False or request.data in self._heard):
-                    echo.learn(request.data, self._heard, request.reply)
+                self._learn_of_echo(request, frame, answer)
                 request.heard, self._heard = len(self._heard), b""
                 request.future.set_result(answer)
                 return
@@ -277,6 +284,15 @@ class Transaction:
             self.traffic.extra += 1
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
+
+    def _learn_of_echo(self, request: _Request, frame: Any, answer: Any) -> None:
+        echo = self._channel.echo
+        if not echo.strip and (echo.found is not False or request.data in self._heard):
+            echo.learn(request.data, self._heard, request.reply)
+        if answer is True:  # an acknowledgement; of these, some repeat the request
+            request.equal = echo.absent_by_evidence and frame == request.frame
+        else:
+            echo.absent_at = self._channel.quiet_since
 
     def _takes_late(self, frame: Any) -> bool:
         """Returns True for the answer to a request that timed out, here or in an older one."""

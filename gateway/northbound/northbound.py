@@ -30,11 +30,11 @@ from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming
 from gateway.northbound.requests.own_writes import OwnWrites
-from gateway.northbound.session import exposures
+from gateway.northbound.session import dead_routes, exposures
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.northbound.session.one_process import only_process
 from gateway.northbound.session.session import CLOSE_WITHIN, open_session
-from gateway.northbound.session.session_settings import configure, connect_endpoints, drop_limit
+from gateway.northbound.session.session_settings import configure, drop_limit, endpoints
 from gateway.northbound.session.watchdog import Watchdog
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample, Tag, WriteResult
@@ -43,6 +43,7 @@ from gateway.values import Value
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 STATUS_EVERY = 5.0  # seconds
+_ROUTERS_EVERY = 1.0  # seconds between two lost routers that count
 _FLUSH_TIMEOUT = 0.5  # seconds for waiting puts when the gateway ends
 
 
@@ -269,6 +270,7 @@ class Northbound:
             self._declared = await off_loop(self._declare_first, session, declarations, links)
             tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
+            tasks.create_task(self._after_lost_routers())
             await self._admission.active.wait()
             self._plant.begin()
             self._incoming.begin()
@@ -281,6 +283,14 @@ class Northbound:
             await off_loop(self._incoming.changed)  # a reload came between
             log.info("Zenoh session ready", prefix=self.keys.prefix, id=str(session.zid()))
             tasks.create_task(self._republisher.run())
+
+    async def _after_lost_routers(self) -> None:
+        lost = self._links.router_lost
+        while True:
+            await lost.wait()
+            lost.clear()
+            await dead_routes.forget(self._config)
+            await asyncio.sleep(_ROUTERS_EVERY)
 
     def _declare_first(
         self,
@@ -326,7 +336,7 @@ class Northbound:
     def _collect_status(self) -> Mapping[str, Mapping[str, object]]:
         documents = dict(self._plant.status())
         documents["status"] = {**documents["status"], **self._admission.claiming.status()}
-        links = {"to": self._links.kinds(), "connect": connect_endpoints(self._config)}
+        links = {"to": self._links.kinds(), "connect": endpoints(self._config, "connect")}
         zenoh_document = {**self.counters(), **links}
         own = {"zenoh": zenoh_document, "outcomes": self._incoming.outcomes()}
         return {**documents, **own, **self._admission.documents()}

@@ -270,6 +270,10 @@ class Plant:
                 return bad(tag, Reason.DISABLED, self._wall(), REMOVED)
             return self.mirror[current]
 
+    def holds(self, tag: Tag) -> bool:
+        """Returns True for a value that clients write and a master reads."""
+        return any(store.holds(tag) for store in self.stores)
+
     def tags(self) -> Iterable[Tag]:
         return self._tags.values()
 

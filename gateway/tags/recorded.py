@@ -9,20 +9,18 @@ from gateway.tags.tag import Tag
 
 # The place of a sample in the order of recording: the file, the run, and the number in the run.
 Place = tuple[str, int, int]
-# Samples with their places. `Damaged` stands for samples that are lost; the last pair has True if
-# this was all. A sample without a place is not stored yet: it is found again later.
+# Samples with their places. `Damaged` stands for samples that are lost; the last pair has
+# True. A sample without a place is not stored yet: it is found again later.
 Recorded = Iterator[tuple[Sample | Damaged | bool, Place | None]]
 
 
 class RecordedQuery(NamedTuple):
     """The samples of tags (by `device/name`), from after the place `after`.
 
-    The answer may end after fewer samples than `page`, None for all. `now`: ns since 1970, when
-    the query came.
+    `now`: ns since 1970, when the query came.
     """
 
     tags: Mapping[str, Tag]
     time_range: str
     after: Place | None
-    page: int | None
     now: int

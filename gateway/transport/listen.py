@@ -15,6 +15,7 @@ from gateway.transport.tcp import configure
 
 log = structlog.get_logger("gateway.line")
 MOST_CONNECTIONS = 32
+_BUSY = 10.0  # seconds since its last bytes for which a connection is not closed for another one
 _WAITING = 8  # connections that the system accepts before this process does
 
 
@@ -62,9 +63,16 @@ class Listener:
     async def _accept(self, connection: socket.socket, connect: Callable[[], Connected]) -> None:
         loop = asyncio.get_running_loop()
         if len(self._ports) >= MOST_CONNECTIONS:
-            log.warning("connection refused", port=self._name, why="too many masters")
-            connection.close()
-            return
+            idlest = min(
+                self._ports, key=lambda port: (port.heard_at > port.opened_at, port.heard_at)
+            )
+            why, busy = "too many masters", loop.time() - idlest.heard_at < _BUSY
+            if busy and idlest.heard_at > idlest.opened_at:
+                log.warning("connection refused", port=self._name, why=why)
+                connection.close()
+                return
+            log.warning("connection closed", port=self._name, why=f"{why}: the idlest goes")
+            await idlest.close()
         accepted = _Accepted(self._name, connect(), self._ports)
         try:
             configure(connection)
@@ -91,6 +99,7 @@ class _Accepted:
         self.stream = StreamPort(name, self)
         self._receiver = receiver
         self._ports = ports
+        self.opened_at = self.heard_at = asyncio.get_running_loop().time()
         ports.add(self)
         self.stream.ready()
         receiver.opened(self)
@@ -104,6 +113,7 @@ class _Accepted:
         await self.stream.close()
 
     def received(self, data: bytes) -> None:
+        self.heard_at = asyncio.get_running_loop().time()
         self._receiver.received(data)
 
     def lost(self, error: Exception) -> None:

@@ -66,7 +66,7 @@ def _one_line(text: str) -> str:
 # -- plants with the settings of a page --------------------------------------------------------
 
 TAGS = {
-    "speed": {"address": "D100"},
+    "speed": {"address": "D100", "alarm": {"high": 0}},  # it is always reached
     "recipe": {"address": "D500", "write": {"min": 1, "max": 40}},
 }
 OVEN = {

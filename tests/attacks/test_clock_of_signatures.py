@@ -4,6 +4,7 @@ import asyncio
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 from tests.attacks.security_pages import client, plant_file
@@ -12,13 +13,14 @@ from tests.e2e.processes import Program, free_port
 from tests.northbound.access import secret
 from tests.zenoh_peer import ZenohPeer
 
-# The command itself, with a wall clock that is off; SIGUSR1 changes it once more.
+# The command itself, with a wall clock that is off by seconds in a file; SIGUSR1 reads it again.
 RUN = """
 import signal, sys, time
-real, off = time.time_ns, [int(sys.argv.pop(1))]
-then = int(sys.argv.pop(1))
+real, file, off = time.time_ns, sys.argv.pop(1), [0]
+def read(*_): off[0] = int(open(file).read())
+read()
 time.time_ns = lambda: real() + off[0] * 10**9
-signal.signal(signal.SIGUSR1, lambda *_: off.__setitem__(0, then if off[0] == 0 else 0))
+signal.signal(signal.SIGUSR1, read)
 from gateway.cli.main import main
 main()
 """
@@ -32,10 +34,16 @@ def plant(folder: Path, port: int) -> Path:
     return plant_file(folder, text, port)
 
 
-def run(path: Path, off: int, then: int = 0) -> Program:
-    program = Program(sys.executable, "-c", RUN, off, then, "run", path)
+def run(path: Path, off: int) -> Program:
+    (path.parent / "off").write_text(str(off))
+    program = Program(sys.executable, "-c", RUN, path.parent / "off", "run", path)
     program.says("Zenoh session ready")
     return program
+
+
+def set_clock(folder: Path, program: Program, off: int) -> None:
+    (folder / "off").write_text(str(off))
+    os.kill(program.pid, signal.SIGUSR1)
 
 
 async def refusal(peer: ZenohPeer, attachment: bytes) -> str:
@@ -53,12 +61,15 @@ async def test_a_signed_write_counts_once_after_a_power_cut_and_a_clock_that_is_
         async with client(endpoint) as peer:
             alice = Writer(peer, ALICE)
             await alice.until("ok")
-            stolen = alice.signed(b"7")
+            stolen, signed = alice.signed(b"7"), time.monotonic()
             [reply] = await peer.get(RECIPE, b"7", attachment=stolen)
             assert reply.ok
         program.end(signal.SIGKILL)
-    with await asyncio.to_thread(run, path, -12) as program:
+    with await asyncio.to_thread(run, path, -3600) as program:
         async with client(endpoint) as peer:
+            assert "ahead of the gateway's clock" in await refusal(peer, stolen)
+            # Its time comes again in seven seconds, however long the start has taken.
+            set_clock(tmp_path, program, -round(time.monotonic() - signed) - 7)
             reasons = [await refusal(peer, stolen)]
             while "s ago" not in reasons[-1] or len(reasons) < 20:
                 await asyncio.sleep(0.1)
@@ -73,12 +84,12 @@ async def test_a_clock_of_the_gateway_that_was_a_day_ahead_locks_no_writer_out(
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{(port := free_port())}"
     path = plant(tmp_path, port)
-    with await asyncio.to_thread(run, path, 0, DAY) as program:
+    with await asyncio.to_thread(run, path, 0) as program:
         async with client(endpoint) as peer:
             alice = Writer(peer, ALICE)
             await alice.until("ok")
-            os.kill(program.pid, signal.SIGUSR1)
+            set_clock(tmp_path, program, DAY)
             assert await alice.says(b"7", alice.signed(b"7")) == "not-allowed"
             assert await alice.says(b"7", alice.signed(b"7", off=DAY)) == "ok"
-            os.kill(program.pid, signal.SIGUSR1)
+            set_clock(tmp_path, program, 0)
             assert await alice.says(b"7", alice.signed(b"7")) == "ok"

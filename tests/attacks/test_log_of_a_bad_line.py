@@ -3,7 +3,7 @@
 import asyncio
 from pathlib import Path
 
-from gateway.cli.repeats import BURST
+from gateway.cli.line.repeats import BURST
 from tests.attacks.tcp_peer import peer, tcp_reply
 from tests.e2e.processes import started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint

@@ -30,6 +30,9 @@ RECIPE, DIAL = "plant/mixer/recipe/@set", "plant/oven/dial/@set"
 GROUP = "plant/mixer/@set"
 LOOPBACK, GLOBAL = "plant/oven/@loopback", "plant/@gateway/demo/lines/annex/global"
 STATUS = "plant/@gateway/demo/status"
+ALARMS = "plant/@gateway/demo/alarms"
+ALARM = f"{ALARMS}/mixer/speed"
+BY = b'{"by": "Ana"}'
 FORGED = b'{"value": "forged", "quality": "good", "time": "2026-11-20T12:00:00Z"}'
 
 
@@ -38,13 +41,14 @@ class Rights(NamedTuple):
 
     reads: bool
     writes: tuple[str, ...] = ()
+    acknowledges: bool = True
 
 
 # The users of the page, and those of its section on other rights.
 USERS = {
-    "viewer": Rights(True),
+    "viewer": Rights(True, acknowledges=False),
     "operator": Rights(True, (RECIPE, DIAL, GROUP)),
-    "health": Rights(False),
+    "health": Rights(False, acknowledges=False),
     "commander": Rights(True, (LOOPBACK, GLOBAL)),
     "mixer-operator": Rights(True, (RECIPE, GROUP)),
     "recipe-operator": Rights(True, (RECIPE,)),
@@ -54,7 +58,7 @@ USERS = {
 def with_other_rights(page_rules: str) -> dict[str, Any]:
     """Returns the rules of the page with three users more, as the page explains."""
     found: dict[str, Any] = rules(page_rules)
-    kept, like_write, like_outcome, _, one_device, some_tags = [
+    kept, like_write, like_outcome, _, _, one_device, some_tags = [
         re.findall(r"`([^`]+)`", unit.text)
         for unit in units(RULES)
         if unit.section == "Other rights"
@@ -182,6 +186,7 @@ async def reads(person: ZenohPeer, rights: Rights) -> None:
         ("plant/**/@meta", VALUES),
         ("plant/*/@block", 1),
         ("plant/@gateway/demo/lines/*", 2),
+        (f"{ALARMS}/**", 5),  # of a tag, two devices and two lines
         ("plant/mixer/speed?max_age=1h", 1),
         ("**", 0),
     ):
@@ -230,6 +235,11 @@ async def asks(person: ZenohPeer, rights: Rights, value: bytes) -> None:
     for key, data in requests.items():
         replies = await person.get(key, data, target="ALL")
         assert [reply.ok for reply in replies] == ([True] if key in rights.writes else []), key
+    replies = await person.get(ALARM, BY, target="ALL")
+    assert [reply.ok for reply in replies] == [True] * rights.acknowledges
+    for key in (f"{ALARMS}/*/*", f"{ALARMS}/mixer/**", f"{ALARMS}/**"):
+        for reply in await person.get(key, BY, target="ALL"):
+            assert not reply.ok, key
     if RECIPE not in rights.writes:
         for key in ("plant/mixer/**/@set", "plant/**/@set", "**/@set", "plant/**", "**"):
             replies = await person.get(key, value, target="ALL")

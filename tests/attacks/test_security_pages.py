@@ -136,6 +136,8 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "those of `health`: to query the status and nothing else, which is enough for a "
         "container.": (RIGHTS,),
         "| `requires a name and password` | set the variables |": (NO_USER,),
+        "| `takes connections and does not answer` | the gateway stands still: stopped, or without "
+        "a processor |": ("test_a_gateway_that_stands_still_is_called_that",),
         "| `refuses the user operator` | the name or the password is wrong |": (RIGHTS,),
         "| `has an untrusted certificate` | `ca` has not signed it, or it is not valid for that "
         "address |": (OTHER_ADDRESS,),
@@ -224,7 +226,7 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "write to `**/@set` would still arrive, because a rule applies only to keys that are "
         "completely within its own.": (WILDCARD,),
         "| `viewer` | read everything |": (USERS,),
-        "| `operator` | read and write |": (USERS,),
+        "| `operator` | read, write, acknowledge alarms |": (USERS,),
         "| `health` | query the status, for `plc-gateway health` |": (USERS, RIGHTS),
         "| `gateway` | on a router: publish and answer as a gateway |": (USERS, SECOND, TAKEOVER),
         "Denied messages are dropped without an answer: a `get` returns nothing, a `put` seems to "
@@ -243,6 +245,9 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "a rule like `outcome` for the same keys.": (USERS,),
         "This subject does not have the rule `command-none`. So it may also command all stations "
         "of a line.": (USERS,),
+        "**Alarms.** A user who may read may also acknowledge alarms, unless the user has the rule "
+        "`acknowledge-none`. Such a user reads alarms with a `get` on "
+        "`plant/@gateway/*/alarms/**`.": (USERS,),
         "**One device only.** To let a user write one device only, use `plant/mixer/**/@set` "
         "instead of `plant/**/@set` in a rule of its own like `write`. The rule `outcome` stays as "
         "it is: the gateway declares the whole key.": (USERS,),

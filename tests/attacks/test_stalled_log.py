@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from tests.e2e.processes import ROOT, station, vigor_line, write_config
+from tests.e2e.processes import PATIENCE, ROOT, station, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {"count": {"address": "D10"}, "recipe": {"address": "D500", "write": True}}
@@ -36,11 +36,12 @@ async def test_a_stalled_log_stops_neither_values_nor_writes_nor_the_end(tmp_pat
     endpoint = free_endpoint()
     tty = tmp_path / "tty"
     file = write_config(tmp_path / "c.yaml", endpoint, {"hall": vigor_line(str(tty), TAGS)})
+    link = {"connect/endpoints": [endpoint], "connect/timeout_ms": 300_000}
     with station("pty", str(tty)) as plc:
         plc.tell("count 1 D 10")
         async with (
             stalled(file) as (gateway, reader),
-            ZenohPeer("client", connect=[], config={"connect/endpoints": [endpoint]}) as client,
+            ZenohPeer("client", connect=[], config=link) as client,
         ):
             heard = await client.subscribe("plant/**")
             await client.until_alive(
@@ -54,5 +55,5 @@ async def test_a_stalled_log_stops_neither_values_nor_writes_nor_the_end(tmp_pat
             [reply] = await client.get("plant/mixer/recipe/@set", b"7")
             assert reply.ok
             gateway.send_signal(signal.SIGTERM)
-            assert await asyncio.to_thread(gateway.wait, 5) == 0
+            assert await asyncio.to_thread(gateway.wait, PATIENCE) == 0
             assert b"write failed" in os.read(reader, 4096)

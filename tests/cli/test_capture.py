@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.capture import Capture
+from gateway.cli.line.capture import Capture
 from gateway.config import LineConfig, load
 from gateway.errors import GatewayError
 from tests.conftest import needs

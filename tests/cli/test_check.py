@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gateway.cli.check import seconds
+from gateway.cli.config.check import seconds
 from tests.cli.conftest import TAGS, Command
 from tests.e2e.processes import plc_gateway, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint

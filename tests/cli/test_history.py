@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.history_files import Column, write_csv
+from gateway.cli.history.history_files import Column, write_csv
 from gateway.parts.history.file import HistoryFile
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import Command
 from tests.e2e.processes import vigor_line, write_config
-from tests.history.recorded import NOON, SECOND
+from tests.history.recorded import NOON, SECOND, store_run
 from tests.history_writer import tag
 
 HOUR = "[2026-11-21T12:00:00Z..2026-11-21T12:00:40Z["
@@ -41,7 +41,7 @@ not-recorded
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("gateway.cli.history._wall", lambda: NOON + 3600 * SECOND)
+    monkeypatch.setattr("gateway.cli.history.history._wall", lambda: NOON + 3600 * SECOND)
     speed, name, other = tag("speed"), tag("name"), tag("other")
     samples = [
         good(speed, 5.5, NOON),
@@ -53,9 +53,8 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         good(tag("steps"), (1, 2.5), NOON + 25 * SECOND),
     ]
     with closing(HistoryFile(tmp_path / "history.db", 10**8)) as file:
-        file.store(1, 0, samples[:2])
-        file.sort(1, NOON)
-        file.store(2, 0, samples[2:])  # as a killed gateway leaves it
+        store_run(file, samples[:2])
+        file.store(3, samples[2:])  # as a killed gateway leaves it
     tags = {
         "speed": {"address": "D10"},
         "name": {"address": "D600", "type": "string[8]"},
@@ -94,7 +93,7 @@ def test_no_link_that_waits_is_followed(
     assert command("history", "export", config, "--time", HOUR, "--output", file).code == 0
     assert (other.read_text(), file.read_text()) == ("kept", EXPORTED)
     assert not file.is_symlink()
-    monkeypatch.setattr("gateway.cli.history_files.token_hex", lambda _: "known")
+    monkeypatch.setattr("gateway.cli.history.history_files.token_hex", lambda _: "known")
     (tmp_path / "more.csv.known.unfinished").symlink_to(other)
     done = command("history", "export", config, "--output", tmp_path / "more.csv")
     assert (done.code, other.read_text()) == (2, "kept")
@@ -167,4 +166,20 @@ def test_lost_samples_are_told_and_all_others_exported(
     done = command("history", "export", config, "--time", HOUR)
     assert done.code == 1
     assert "are lost: the file is damaged there; all others were exported" in done.err
-    assert done.out.splitlines()[1:] == EXPORTED.splitlines()[3:]
+    assert done.out.splitlines()[1:] == EXPORTED.splitlines()[2:]
+
+
+def test_a_history_that_was_moved_aside_is_salvaged_or_known(
+    config: Path, command: Command, tmp_path: Path
+) -> None:
+    before = command("history", "export", config, "--time", HOUR)
+    for word in ("salvage", "known"):
+        done = command("history", word, config)
+        assert (done.code, "was moved aside" in done.err) == (1, True)
+    (tmp_path / "history.db").rename(tmp_path / "history.db.aside-20261121T120000.0Z")
+    done = command("history", "salvage", config)
+    assert (done.code, "7 samples are back" in done.err) == (0, True)
+    assert command("history", "export", config, "--time", HOUR) == before
+    (tmp_path / "history.db").rename(tmp_path / "history.db.aside-20261121T130000.0Z")
+    assert command("history", "known", config).code == 0
+    assert len([*tmp_path.glob("history.db.known-*Z")]) == 1

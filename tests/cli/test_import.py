@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import yaml
 
-from gateway.cli.import_command import _meaning
+from gateway.cli.sheets.import_command import _meaning
 from gateway.config import load
-from gateway.config.yaml_insert import with_tags, written
+from gateway.config.yaml.insert import with_tags, written
 from gateway.errors import ConfigError
 from tests.cli.conftest import Command
 from tests.sheets import plant

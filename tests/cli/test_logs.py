@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 import structlog
 
-from gateway.cli import logs, repeats
-from gateway.cli.logs import QueuedHandler
-from gateway.cli.repeats import Repeats
+from gateway.cli.line import logs, repeats
+from gateway.cli.line.logs import QueuedHandler
+from gateway.cli.line.repeats import Repeats
 from gateway.contract import audited
 
 

@@ -6,8 +6,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from gateway.cli.new import NamedStation, document
-from gateway.cli.scan import Found
+from gateway.cli.config.new import NamedStation, document
+from gateway.cli.line.scan import Found
 from gateway.config import load
 from gateway.protocols.modbus import ModbusTcp
 from gateway.protocols.vigor import Vigor

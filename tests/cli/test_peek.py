@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gateway.cli.peek import one_device, view_of
-from gateway.cli.peek_table import MEDIUM, WIDE, Cell, change_text, number_text, table_of
+from gateway.cli.line.peek import one_device, view_of
+from gateway.cli.line.peek_table import MEDIUM, WIDE, Cell, change_text, number_text, table_of
 from gateway.config import ConfigErrors
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit

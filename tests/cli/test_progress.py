@@ -24,7 +24,8 @@ lines:
 # The command itself, with a file that takes as long as the pipe named first is empty.
 SLOW = """
 import sys
-from gateway.cli import check, main
+from gateway.cli import main
+from gateway.cli.config import check
 pipe, load = sys.argv.pop(1), check.load
 def slow(file, report=None):
     if report is not None:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.cli import scan_command as show
-from gateway.cli.scan import Plan, Report, planned, scan
+from gateway.cli.line import scan_command as show
+from gateway.cli.line.scan import Plan, Report, planned, scan
 from gateway.errors import ConfigError, LineDown
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation

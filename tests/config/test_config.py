@@ -13,10 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config import Config, ConfigErrors, load, parsers, schema
-from gateway.config.model import HistorySection, TagDefaults, WebSection
-from gateway.config.session_model import Section, ZenohSection
-from gateway.config.yaml_file import read_yaml
+from gateway.config import Config, ConfigErrors, load, schema
+from gateway.config.settings import parsers
+from gateway.config.settings.model import HistorySection, WebSection
+from gateway.config.settings.session_model import Section, ZenohSection
+from gateway.config.tags.section import TagDefaults
+from gateway.config.yaml.file import read_yaml
 from gateway.errors import ConfigError
 from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.protocols.computer_link import ComputerLink
@@ -337,7 +339,8 @@ LINES = [
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, echo, serve, listen_only, modem, defaults or devices",
+        "use port, baudrate, format, echo, serve, request_gap, listen_only, modem, defaults or "
+        "devices",
     ),
     bad(
         "negative baud rate",

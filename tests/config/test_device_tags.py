@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from gateway.config import Config, ConfigErrors, device_tags, load
-from gateway.config.tag_rules import build_tag
+from gateway.config import Config, ConfigErrors, load
+from gateway.config.tags import device_tags
+from gateway.config.tags.word_tags import build_tag
 from gateway.tags import Tag
 
 SPEED = {"address": "D10", "scale": 0.1, "every": "5s", "write": {"min": 0, "max": 9}}

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from gateway.config import Config, ConfigErrors, expanded_text, load
 from gateway.config.messages import Mistakes
-from gateway.config.template_files import SHIPPED
-from gateway.config.template_text import filled
-from gateway.config.templates import expanded
-from gateway.config.yaml_dump import dumped
-from gateway.config.yaml_file import YamlFile, read_yaml
+from gateway.config.templates.expand import expanded
+from gateway.config.templates.files import SHIPPED
+from gateway.config.templates.text import filled
+from gateway.config.yaml.dump import dumped
+from gateway.config.yaml.file import YamlFile, read_yaml
 from gateway.errors import ConfigError
 from gateway.tags import Tag
 from tests.cli.conftest import Command, command

@@ -9,9 +9,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config import ConfigErrors, load, yaml_file
-from gateway.config.yaml_events import plain_data
-from gateway.config.yaml_file import read_yaml
+from gateway.config import ConfigErrors, load
+from gateway.config.yaml import file as yaml_file
+from gateway.config.yaml.events import plain_data
+from gateway.config.yaml.file import read_yaml
 
 TEXTS = frozenset({"address", "name"})
 PLANT = """\

@@ -27,7 +27,7 @@ async def test_the_time_without_a_gateway_is_a_gap(tmp_path: Path) -> None:
             good(tag("speed"), 5, now - 4000 * SECOND),
             good(tag("n"), 1, now - 3000 * SECOND),
         ]
-        file.store(1, 0, earlier)
+        file.store(1, earlier)
     tags = {"speed": {"address": "D{first}"}, "n": {"address": "D{first + 1}"}}
     template = {"parameters": ["first"], "defaults": {"history": True}, "tags": tags}
     line = vigor_line("simulator", {})

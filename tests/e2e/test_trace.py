@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.replay import replay
+from gateway.cli.line.replay import replay
 from tests.attacks.slave import crc
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 from gateway.config import load
@@ -115,7 +116,7 @@ class Rig:
     def transacted(self) -> Transacted:
         """The next job that is not `Idle`, at its time."""
         job = self.next()
-        if isinstance(job, Idle):
+        while isinstance(job, Idle) and self.now < job.until < inf:
             self.now = job.until
             job = self.next()
         assert not isinstance(job, Idle | Reopen)

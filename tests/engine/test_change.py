@@ -140,6 +140,10 @@ def test_devices_come_and_go_on_one_line() -> None:
     assert isinstance(probe, Probe)
     assert probe.device is second
     rig.conclude(probe, Resynced(1))
+    settle = rig.next()  # its station may be that of a device before
+    assert isinstance(settle, Settle)
+    rig.conclude(settle, Settled(None))
+    rig.conclude(rig.transacted(), Resynced(1))
     asked = {_device_of(rig) for _ in range(6)}
     assert asked == {first, second}
     rig.note(rig.engine.change(Changes(removed=[first]), rig.now))

@@ -13,6 +13,8 @@ from typing import Any
 from gateway.contract import payload
 from gateway.contract.payload import WriteOutcome
 from gateway.parts.history import Historian
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.recent import SortedRun
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value
 from tests.history_writer import WEEK, tag, until
@@ -52,9 +54,22 @@ def numbered(count: int, start: int = 0, tag: Tag = SPEED) -> Sequence[Sample]:
     return [good(tag, n, NOON + n * SECOND) for n in range(start, start + count)]
 
 
-def sorted_runs(path: Path) -> list[tuple[int, int]]:
+def store_run(file: HistoryFile, samples: Sequence[Sample], now: int = NOON) -> SortedRun:
+    """Stores samples as a run of their own."""
+    number = file.next_number()
+    file.store(number, samples)
+    run = file.close_run(number, number + len(samples), now)
+    assert run is not None
+    return run
+
+
+def all_runs(file: HistoryFile) -> list[SortedRun]:
+    return file.closed_runs(NOON, file.next_number())
+
+
+def closed_runs(path: Path) -> list[tuple[int, int]]:
     with closing(sqlite3.connect(path)) as database:
-        return list(database.execute("SELECT run, samples FROM run ORDER BY run"))
+        return list(database.execute("SELECT id, samples FROM run ORDER BY id"))
 
 
 def write(number: int) -> WriteOutcome:

@@ -24,7 +24,7 @@ from gateway.parts.history.newest import Newest
 from gateway.parts.history.reader import Reader
 from gateway.parts.history.recent import Recent
 from gateway.tags import Reason, Sample, bad, good
-from tests.history.recorded import DOOR, NOON, SECOND, SPEED
+from tests.history.recorded import DOOR, NOON, SECOND, SPEED, all_runs, store_run
 
 MINUTE = 60 * SECOND
 ALWAYS = TimeRange(EARLIEST, LATEST)
@@ -202,11 +202,11 @@ def samples(count: int, seed: int) -> list[Sample]:
 def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[Course, Newest]]:
     """A file with all runs but the last, which is in memory."""
     with closing(HistoryFile(path, 10**8)) as file:
-        for number, run in enumerate(runs[:-1], 1):
-            file.store(number, 0, run)
-            file.sort(number, NOON)
+        for run in runs[:-1]:
+            store_run(file, run)
         recent = Recent(10**6, 600)
-        recent.opened(file.identity, file.sorted_runs(), {})
+        recent.opened(file.identity, (), file.extent, file.next_number())
+        recent.set_sorted(all_runs(file))
         recent.add(runs[-1])
         reader = Reader(path)
         try:
@@ -291,7 +291,7 @@ def test_a_value_is_not_valid_over_samples_that_are_lost(tmp_path: Path) -> None
     runs = [[good(SPEED, n, at(n)) for n in range(begin, begin + 10)] for begin in (0, 10, 20, 30)]
     with filed(tmp_path / "h.db", [*runs, []]) as (course, _):
         with closing(sqlite3.connect(tmp_path / "h.db")) as file:
-            file.execute("UPDATE sample SET value = 7 WHERE run = 2 AND value = 15")
+            file.execute("UPDATE sample SET value = 7 WHERE value = 15")
             file.commit()
         answer = course.buckets(SPEED, ALWAYS, 10 * SECOND, Now(at(40), is_valid=True), nothing)
         found = [(b.quality, b.min, b.max, b.reason) for b in islice(answer, 4)]

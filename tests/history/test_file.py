@@ -1,40 +1,27 @@
 """The file across restarts, and other files in its place."""
 
 import shutil
-import sqlite3
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from gateway.parts.history.file import HistoryFile
-from tests.history.recorded import NOON, SECOND, history, numbered, sorted_runs, values
+from tests.history.recorded import NOON, SECOND, closed_runs, history, numbered, store_run, values
 from tests.history_writer import until
 
 
-def test_an_unsorted_run_of_an_earlier_process_is_sorted_at_the_start(tmp_path: Path) -> None:
+def test_a_run_of_an_earlier_process_gets_its_index_at_the_start(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with history(path) as historian:
         historian.record(numbered(100))
-    assert sorted_runs(path) == []
+    assert closed_runs(path) == []
     with history(path) as historian:
         historian.record(numbered(100, 100))
         assert values(historian) == list(range(200))
-    assert sorted_runs(path) == [(1, 100)]
+    assert closed_runs(path) == [(1, 100)]
     with closing(HistoryFile(path, 10**8)) as file:
-        assert file.unsorted_runs() == {2: (NOON + 100 * SECOND, NOON + 199 * SECOND, 100)}
-
-
-def test_a_file_opens_whose_run_was_sorted_before_its_end(tmp_path: Path) -> None:
-    """As two gateways that wrote one file have left it."""
-    path = tmp_path / "h.db"
-    with closing(HistoryFile(path, 10**8)) as file:
-        file.store(1, 0, numbered(100))
-        file.sort(1, NOON)
-        file.store(1, 100, numbered(100, 100))
-    with history(path) as historian:
-        assert values(historian) == list(range(200))
-    assert sorted_runs(path) == [(1, 200)]
+        assert file.extent(101, 1000) == (NOON + 100 * SECOND, NOON + 199 * SECOND, 100)
 
 
 @pytest.mark.parametrize("ended_well", [True, False])
@@ -43,9 +30,9 @@ def test_an_older_file_in_its_place_gets_the_samples_in_memory(
 ) -> None:
     path, older = tmp_path / "h.db", tmp_path / "older.db"
     with closing(HistoryFile(older, 10**8)) as file:
-        file.store(1, 0, numbered(200))
+        file.store(1, numbered(200))
         if ended_well:
-            file.sort(1, NOON)
+            file.close_run(1, 201, NOON)
     with history(path) as historian:
         historian.record(numbered(50, 1000))
         until(historian, waiting=0)
@@ -63,12 +50,10 @@ def test_an_older_copy_in_place_and_then_the_newer_again_lose_nothing(tmp_path: 
     """Both are the same file by their identity, and number 2 is another run in each."""
     path, older, newer = tmp_path / "h.db", tmp_path / "older.db", tmp_path / "newer.db"
     with closing(HistoryFile(path, 10**8)) as file:
-        file.store(1, 0, numbered(100))
-        file.sort(1, NOON)
+        store_run(file, numbered(100))
     shutil.copy(path, older)
     with closing(HistoryFile(path, 10**8)) as file:
-        file.store(2, 0, numbered(50, 100))
-        file.sort(2, NOON)
+        store_run(file, numbered(50, 100))
     with history(path) as historian:
         historian.record(numbered(50, 1000))
         until(historian, waiting=0)
@@ -82,13 +67,3 @@ def test_an_older_copy_in_place_and_then_the_newer_again_lose_nothing(tmp_path: 
         assert set(values(historian)) == {*range(150), *range(1000, 1100)}
     with history(path) as historian:
         assert set(values(historian)) == {*range(150), *range(1000, 1100)}
-
-
-def test_a_file_without_an_identity_gets_one(tmp_path: Path) -> None:
-    path = tmp_path / "h.db"
-    with history(path) as historian:
-        historian.record(numbered(5))
-    with closing(sqlite3.connect(path)) as database:
-        database.execute("DROP TABLE file")
-    with history(path) as historian:
-        assert values(historian) == list(range(5))

@@ -15,7 +15,7 @@ from gateway.errors import BadValue, Busy
 from gateway.parts.history import Historian
 from gateway.parts.history.reader import Reader
 from gateway.parts.history.recent import Recent
-from gateway.parts.history.sections import FullRow
+from gateway.parts.history.rows import Row
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, bad, good
 from gateway.values import Layout, Value, parse_type
@@ -26,10 +26,10 @@ from tests.history.recorded import (
     SECOND,
     SMALL,
     SPEED,
+    closed_runs,
     history,
     numbered,
     record_outcome,
-    sorted_runs,
     values,
     write,
 )
@@ -126,7 +126,7 @@ def test_a_clock_set_back_loses_nothing_and_the_answer_is_in_order(tmp_path: Pat
         until(historian, waiting=0)
         found = [sample.time for sample in historian.samples(SPEED, EVERYTHING, None)]
     assert found == sorted(times)
-    assert len(sorted_runs(tmp_path / "h.db")) == 5
+    assert len(closed_runs(tmp_path / "h.db")) == 5
 
 
 def test_queries_see_each_sample_once_while_runs_move_to_disk(tmp_path: Path) -> None:
@@ -206,13 +206,13 @@ def test_an_answer_begins_with_the_oldest_sample_that_is_left(
 ) -> None:
     at_once = Reader.rows
 
-    def late(reader: Reader, *arguments: Any) -> list[FullRow] | None:
+    def late(reader: Reader, *arguments: Any) -> tuple[list[Row], bool] | None:
         monkeypatch.undo()
         first = historian.document()["oldest"]
         for start in range(20_000, 60_000, 1000):
             if historian.document()["oldest"] == first:
                 flooded(historian, start, start + 1000)
-        rows: list[FullRow] | None = at_once(reader, *arguments)
+        rows: tuple[list[Row], bool] | None = at_once(reader, *arguments)
         return rows
 
     with history(tmp_path / "h.db", max_size=SMALL) as historian:

@@ -92,27 +92,11 @@ def test_refusals_push_out_no_write(tmp_path: Path) -> None:
         assert written(historian)[-2:] == [999, 1000]  # in the order of time, also from memory
 
 
-def test_a_file_of_an_older_version_gets_a_ring_of_refusals(tmp_path: Path) -> None:
-    path = tmp_path / "h.db"
-    with history(path) as historian:
-        record_outcome(historian, write(1))
-        until(historian, writes_stored=1)
-    with closing(sqlite3.connect(path)) as database:
-        database.execute("DROP TABLE refused")
-    with history(path) as historian:
-        record_outcome(historian, write(2), refused=True)
-        until(historian, refusals_stored=1)
-        assert written(historian) == [1, 2]
-
-
 def test_changes_of_alarms_have_a_ring_of_their_own(tmp_path: Path) -> None:
-    """Also in a file of an older version, which has none."""
     path = tmp_path / "h.db"
     with history(path) as historian:
         record_outcome(historian, write(1))
         until(historian, writes_stored=1)
-    with closing(sqlite3.connect(path)) as database:
-        database.execute("DROP TABLE alarms")
     with history(path) as historian:
         historian.record_alarm(time.time_ns(), '{"event": "raised"}')
         assert [*historian.alarms("[..]")] == ['{"event": "raised"}']

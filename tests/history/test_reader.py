@@ -11,15 +11,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.contract.timerange import EARLIEST, LATEST
-from gateway.errors import Busy, Damaged
-from gateway.parts.history import Historian, TimeRange
+from gateway.errors import Busy
+from gateway.parts.history import TimeRange
 from gateway.parts.history.file import HistoryFile
 from gateway.parts.history.outcomes import Outcome, Ring
 from gateway.parts.history.reader import Part, Reader, in_order
 from gateway.parts.history.recent import Identity
 from gateway.tags import Sample, good
-from tests.history.recorded import DOOR, EVERYTHING, NOON, SECOND, SPEED, history, numbered, values
-from tests.history_writer import WEEK, tag, until
+from tests.history.recorded import (
+    DOOR,
+    EVERYTHING,
+    NOON,
+    SECOND,
+    SPEED,
+    history,
+    moved_aside,
+    numbered,
+    store_run,
+    values,
+)
+from tests.history_writer import tag, until
 
 
 @given(st.lists(st.lists(st.integers(0, 50), max_size=8), max_size=8))
@@ -48,20 +59,17 @@ def test_a_part_is_read_only_when_its_time_comes() -> None:
     assert read == [0, 1, 2]
 
 
-def test_a_run_with_the_number_of_a_dropped_run_is_another_run(tmp_path: Path) -> None:
+def test_a_number_is_used_once(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with closing(HistoryFile(path, 10**8)) as file:
-        file.store(1, 0, numbered(10))
-        before = file.sort(1, NOON)
-        file.drop(1)
-        file.store(1, 0, numbered(10, 10))
-        after = file.sort(1, NOON + SECOND)
-        assert before is not None
-        assert after is not None
+        before = store_run(file, numbered(10))
+        file.drop(before)
+        after = store_run(file, numbered(10, 10))
+        assert after.number == before.end
         reader = Reader(path)
-        listed = reader.sections(file.identity, after)
-        assert reader.rows(file.identity, before, listed) is None
-        assert reader.rows(file.identity, after, listed)
+        assert reader.rows(file.identity, before, range(10)) is None
+        rows, lost = reader.rows(file.identity, after, range(10)) or ([], True)
+        assert (len(rows), lost) == (10, False)
 
 
 def test_writes_that_are_dropped_during_an_answer_end_it_with_an_error(tmp_path: Path) -> None:
@@ -84,10 +92,8 @@ def test_an_answer_never_has_the_values_of_another_tag(tmp_path: Path) -> None:
     for file_path, tags in ((path, (SPEED, DOOR)), (other, (DOOR, SPEED))):
         with closing(HistoryFile(file_path, 10**8)) as file:
             for run in (1, 2, 3):
-                for n, of in enumerate(tags):
-                    times = range(NOON + run * SECOND, NOON + (run + 1) * SECOND, SECOND // 10)
-                    file.store(run, 10 * n, [good(of, of.name, time) for time in times])
-                file.sort(run, NOON)
+                times = range(NOON + run * SECOND, NOON + (run + 1) * SECOND, SECOND // 10)
+                store_run(file, [good(of, of.name, time) for of in tags for time in times])
     with history(path) as historian:
         historian.record(numbered(1, 1000, tag("level")))
         until(historian, waiting=0)
@@ -107,12 +113,10 @@ def test_a_file_that_has_just_been_replaced_answers_no_query(
     path = tmp_path / "h.db"
     everything = TimeRange(EARLIEST, LATEST)
     with closing(HistoryFile(path, 10**8)) as file:
-        file.store(1, 0, numbered(10))
-        run = file.sort(1, NOON)
-        assert run is not None
+        run = store_run(file, numbered(10))
         reader = Reader(path)
-        listed = reader.sections(file.identity, run)
-        assert len(reader.rows(file.identity, run, listed) or []) == 10
+        listed = range(10)
+        assert reader.rows(file.identity, run, listed)
         another = Identity(file.identity.inode, b"another")
         with pytest.raises(Busy, match="another file"):
             reader.rows(another, run, listed)
@@ -124,21 +128,18 @@ def test_a_file_that_has_just_been_replaced_answers_no_query(
             reader.rows(file.identity, run, listed)
 
 
-def test_pages_that_cannot_be_read_are_an_error_not_an_empty_answer(tmp_path: Path) -> None:
+def test_a_table_that_cannot_be_read_is_moved_aside(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with history(path, max_size=5_000_000) as historian:
         historian.record(numbered(30_000))
     with history(path, max_size=5_000_000):
-        pass  # all runs are sorted now
+        pass
     with closing(sqlite3.connect(path)) as database:
         [(root,)] = database.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'sample'")
     with path.open("r+b") as file:
         file.seek((root - 1) * 4096)
         file.write(b"\xa5" * 4096)
-    historian = Historian(path, WEEK, 5_000_000)
-    historian.start()
-    until(historian, state="ok")
-    with pytest.raises(Damaged, match="are lost"):
-        values(historian)
-    assert "damaged" in str(historian.document()["state"])
-    assert historian.close()
+    with history(path, max_size=5_000_000) as historian:
+        historian.record(numbered(5))
+        assert values(historian) == list(range(5))
+    assert len(moved_aside(tmp_path)) == 1

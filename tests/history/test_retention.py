@@ -10,16 +10,18 @@ from gateway.contract.payload import WriteOutcome
 from gateway.errors import Busy
 from gateway.parts.history import Historian, time_range
 from gateway.parts.history.outcomes import MOST_WAITING
-from gateway.parts.history.recent import MOST_RUNS
-from gateway.tags import WriteResult
+from gateway.parts.history.recent import MOST_RUNS, SortedRun
+from gateway.parts.history.retention import age
+from gateway.tags import WriteResult, good
 from tests.history.recorded import (
     EVERYTHING,
     NOON,
     SECOND,
+    SPEED,
+    closed_runs,
     history,
     numbered,
     record_outcome,
-    sorted_runs,
     values,
 )
 from tests.history_writer import WEEK, until
@@ -89,7 +91,7 @@ def test_samples_older_than_keep_are_dropped(tmp_path: Path) -> None:
     with history(
         tmp_path / "h.db", keep=1.0, max_size=1_000_000, wall=lambda: clock[0]
     ) as historian:
-        historian.record(numbered(1500))
+        historian.record(good(SPEED, n, clock[0] + n) for n in range(1500))
         record_outcome(historian, WriteOutcome("k", 1, WriteResult(1, NOON, 0.1), NOON, 0.1))
         until(historian, waiting=0, writes_stored=1)
         assert values(historian) == list(range(1500))
@@ -101,19 +103,51 @@ def test_samples_older_than_keep_are_dropped(tmp_path: Path) -> None:
     pytest.fail("it never went")
 
 
-def test_a_clock_that_is_wrong_for_a_moment_costs_little_history(tmp_path: Path) -> None:
-    clock = [NOON]
+DAY = 86400 * SECOND
+YEARS = 3650 * DAY
+
+
+def ten_minutes(number: int, ahead: int = 0) -> SortedRun:
+    first = NOON + number * 600 * SECOND + ahead
+    return SortedRun(1 + 100 * number, first, first + 599 * SECOND, 100, first + 600 * SECOND)
+
+
+@pytest.mark.parametrize("ahead", [YEARS, -YEARS, 2 * DAY])
+def test_one_clock_makes_nothing_old(ahead: int) -> None:
+    runs = [ten_minutes(number) for number in range(6 * 24 * 6)]  # six days
+    now, week = runs[-1].last + SECOND, 7 * DAY
+    assert age(runs, now, week) == 6 * DAY - 599 * SECOND
+    assert age(runs, now + ahead, week) <= 6 * DAY + week // 10  # it is wrong now
+    back = [*runs, ten_minutes(len(runs), ahead), ten_minutes(len(runs) + 1)]
+    assert age(back, back[-1].last, week) < 6 * DAY + 3600 * SECOND  # it was wrong
+    within = runs[100]._replace(last=runs[100].last + ahead)
+    assert age([*runs[:100], within, *runs[101:]], now, week) < 6 * DAY + 3600 * SECOND
+
+
+def test_a_gateway_that_was_off_for_long_loses_its_history_little_by_little() -> None:
+    runs = [ten_minutes(0), *(ten_minutes(number) for number in range(10_000, 10_100))]
+    assert DAY // 2 < age(runs, runs[-1].last, 7 * DAY) < 2 * DAY
+
+
+@pytest.mark.parametrize("back", [True, False])
+def test_a_clock_ten_years_ahead_for_a_moment_costs_nothing(tmp_path: Path, *, back: bool) -> None:
+    clock = [NOON + 40_000 * SECOND]
     with history(tmp_path / "h.db", max_size=5_000_000, wall=lambda: clock[0]) as historian:
         historian.record(numbered(30_000))
-        until(historian, waiting=0)
-        before = len(sorted_runs(tmp_path / "h.db"))
-        clock[0] += 10 * 365 * 86400 * SECOND
-        historian.record(numbered(100, 30_000))
-        until(historian, waiting=0)
-        time.sleep(0.3)  # several turns of the writer
-        clock[0] = NOON
+        record_outcome(historian, WriteOutcome("k", 1, WriteResult(1, NOON, 0.1), NOON, 0.1))
+        until(historian, waiting=0, writes_stored=1)
+        before = len(closed_runs(tmp_path / "h.db"))
         assert before >= 4
-        assert len(sorted_runs(tmp_path / "h.db")) >= before - 2
+        clock[0] += YEARS
+        historian.record(good(SPEED, n, clock[0] + n) for n in range(30_000, 36_000))
+        until(historian, waiting=0)
+        if back:
+            clock[0] -= YEARS
+            historian.record(good(SPEED, n, clock[0] + n) for n in range(36_000, 42_000))
+            until(historian, waiting=0)
+        assert len(closed_runs(tmp_path / "h.db")) > before
+        assert set(range(36_000)) <= set(values(historian))
+        assert len([*historian.writes(EVERYTHING)]) == 1
 
 
 def test_samples_that_the_disk_cannot_take_are_dropped_oldest_first_and_counted(

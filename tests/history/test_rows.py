@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.contract.timerange import EARLIEST, LATEST
-from gateway.parts.history.rows import from_row, to_row
+from gateway.parts.history.rows import checksum, from_row, to_row, with_checksum
 from gateway.tags import Quality, Reason, Sample, good
 from gateway.values import Value
 from tests.history.recorded import NOON, SPEED
@@ -28,8 +28,10 @@ any_value = st.one_of(
 @given(any_value, st.integers(EARLIEST, LATEST))
 def test_a_value_comes_back_from_sqlite_unchanged(value: Value, time: int) -> None:
     with closing(sqlite3.connect(":memory:")) as database:
-        row = database.execute("SELECT ?, ?, ?, ?", to_row(good(SPEED, value, time))).fetchone()
-    sample = from_row(SPEED, *row)
+        stored = with_checksum(1, 2, to_row(good(SPEED, value, time)))
+        row = database.execute("SELECT ?, ?, ?, ?, ?, ?, ?", stored).fetchone()
+    assert checksum(row[:6]) == row[6]
+    sample = from_row(SPEED, *row[2:6])
     assert type(sample.value) is type(value)
     assert repr(sample.value) == repr(value)
     assert sample._replace(value=None) == Sample(SPEED, None, Quality.GOOD, time)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.cli import direct
+from gateway.cli.line import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
 from gateway.parts.serving.part import ServingPart
@@ -126,11 +126,15 @@ async def test_a_connection_ends_with_bytes_that_are_no_modbus_and_the_next_is_s
         assert await reader.read() == b""
         writer.close()
         await writer.wait_closed()
-    ends = [await asyncio.open_connection("127.0.0.1", number) for _ in range(3)]
-    for _, writer in ends:
+    ends = [await asyncio.open_connection("127.0.0.1", number) for _ in range(4)]
+    for reader, writer in ends[2:]:
         writer.write(bytes.fromhex("0001 0000 0006 01 06 0064 0001"))
-    assert len(await ends[0][0].readexactly(12)) == 12
-    assert await ends[2][0].read() == b""  # one too many
+        assert len(await reader.readexactly(12)) == 12
+    for reader, writer in ends[:2]:
+        assert await reader.read() == b""  # it sent nothing
+        writer.close()
+    ends = [*ends[2:], await asyncio.open_connection("127.0.0.1", number)]
+    assert await ends[2][0].read() == b""  # one too many: all are busy
     task.cancel()
     await asyncio.wait([task])
     assert await ends[0][0].read() == b""

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from gateway.cli.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
-from tests.e2e.processes import PATIENCE, Done, started, vigor_line, write_config
+from tests.e2e.processes import PATIENCE, Done, plc_gateway, started, vigor_line, write_config
 from tests.northbound.access import (
     GATEWAY_RULES,
     PASSWORDS,
@@ -138,6 +139,19 @@ def test_without_a_user_the_command_line_names_the_variables_to_set(tmp_path: Pa
             assert (done.code, done.out) == (1, "")
             assert "requires a name and password" in done.err
             assert f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}" in done.err
+
+
+def test_a_gateway_that_stands_still_is_called_that(tmp_path: Path) -> None:
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D1"}})}
+    file = write_config(tmp_path / "c.yaml", free_endpoint(), lines)
+    with started(file) as program:
+        os.kill(program.pid, signal.SIGSTOP)
+        try:
+            done = plc_gateway("health", file)
+        finally:
+            os.kill(program.pid, signal.SIGCONT)
+        assert (done.code, done.out) == (1, "")
+        assert "takes connections and does not answer: that process stands still" in done.err
 
 
 def test_at_a_router_the_user_of_the_gateway_may_check_its_health_only(

@@ -10,10 +10,27 @@ from gateway.config import ZenohConfig, ZenohMode
 from gateway.errors import (
     ConfigError,
 )
+from gateway.northbound.session.dead_routes import visitor
 from gateway.northbound.session.session import open_session
 from gateway.northbound.session.session_settings import configure
 from gateway.plant.threads import off_loop
 from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+
+def test_the_visitor_after_a_lost_router_reaches_the_gateway_itself(tmp_path: Path) -> None:
+    users = tmp_path / "users.txt"
+    users.write_text("ana:secret\nbob:other\n")
+    users.chmod(0o600)
+    settings = ZenohConfig(
+        listen=("tcp/0.0.0.0:7447",), connect=("tcp/10.0.0.1:7447",), users_file=users
+    )
+    found = visitor(configure(settings))
+    seen = {
+        name: json.loads(found.get_json(name))
+        for name in ("mode", "listen/endpoints", "connect/endpoints", "transport/auth/usrpwd/user")
+    }
+    assert list(seen.values()) == ["peer", [], ["tcp/127.0.0.1:7447"], "ana"]
+    assert found.get_json("transport/auth/usrpwd/dictionary_file") == "null"
 
 
 def test_the_settings_override_the_zenoh_file(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from typing import Any, ClassVar, Literal
 
 import pytest
 
-from gateway.cli import direct
+from gateway.cli.line import direct
+from gateway.cli.line.scan import Plan, planned, scan
 from gateway.cli.main import main
-from gateway.cli.scan import Plan, planned, scan
 from gateway.config import Config, ConfigErrors, load, schema
 from gateway.errors import ConfigError, Refusal, Refused
 from gateway.planning.wire_timing import WireTiming

@@ -135,12 +135,51 @@ def test_a_request_that_another_follows_is_neither_done_nor_answered() -> None:
 
 def test_the_echo_of_a_reply_is_no_request() -> None:
     made, write = bench(), rtu("01 06 0004 0007")
+    assert made.ask(READ) == VALUE
+    assert made.ask(VALUE, after=0.02) == b""
     assert made.ask(write) == write
     assert made.ask(write, after=0.02) == b""  # its echo
     assert made.ask(READ) == VALUE
-    assert made.ask(VALUE, after=0.02) == b""
-    assert made.ask(READ) == VALUE
     assert made.written == [{"setpoint": 7}]
+
+
+@pytest.mark.parametrize("baudrate", [300, 600, 1200])
+def test_a_request_in_pieces_is_answered_on_a_slow_wire(baudrate: int) -> None:
+    character = 11 / baudrate
+    for made, request, reply in (
+        (bench(baudrate=baudrate), READ, VALUE),
+        (_vigor(baudrate), *_VIGOR),
+    ):
+        pieces = [request[at : at + 3] for at in range(0, len(request), 3)]
+        heard = [made.ask(one, after=0.04 + 3 * character) for one in pieces]
+        assert heard == [b""] * (len(pieces) - 1) + [reply]
+
+
+_VIGOR = (b"\x0205511C0002\x0304", b"\x060551003412\x03F8")
+
+
+def _vigor(baudrate: int) -> Bench:
+    tags = {"speed": {"address": "D0", "source": "mixer/speed"}}
+    plc = {"protocol": "vigor", "station": 5, "tags": tags}
+    made = Bench("/dev/ttyS98", {"plc": plc}, baudrate=baudrate)
+    made.values = {"mixer/speed": 0x1234}
+    return made
+
+
+def test_the_pauses_of_a_telephone_line_and_of_the_file_do_no_harm() -> None:
+    half, rest = rtu("01 06 0004 0007")[:5], rtu("01 06 0004 0007")[5:]
+    call = {"port": "modem:/dev/ttyS98"}
+    slow = bench(request_gap="300ms")
+    dialled = Bench(call["port"], {"one": {**STATION, "station": 1, "tags": TAGS}})
+    dialled.values = {"mixer/speed": 0x1234}
+    for made, pause, longer in ((slow, 0.25, 0.35), (dialled, 1.5, 2.5)):
+        assert made.ask(half) == b""
+        assert made.ask(rest, after=pause) == half + rest
+        assert made.ask(half) == b""
+        assert made.ask(rest, after=longer) == b""
+        assert made.ask(half) == b""
+        assert made.ask(READ, after=pause) == VALUE  # the master gave up, and asks again
+        assert len(made.written) == 1
 
 
 def test_a_repeated_write_is_done_again_on_a_line_without_echo() -> None:

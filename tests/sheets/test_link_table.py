@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.import_command import add_tags
+from gateway.cli.sheets.import_command import add_tags
 from gateway.config import load
+from gateway.config.sheets import link_table, read_grid
 from gateway.errors import ConfigError
-from gateway.sheets import link_table, read_grid
 
 LINK = """\
 Number,Command,Master Data,,Slave ID,Slave Data,Length,Word / Bit

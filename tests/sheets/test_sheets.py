@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from openpyxl import Workbook
 
 from gateway.config import ConfigErrors, load
-from gateway.config.sheet_tags import other_settings, parsed
+from gateway.config.sheets import Sheet, cells, grid, read_grid, read_sheet
+from gateway.config.sheets.columns import columns_of, letter
+from gateway.config.sheets.tags import other_settings, parsed
 from gateway.errors import ConfigError
-from gateway.sheets import Sheet, cells, grid, read_grid, read_sheet
-from gateway.sheets.columns import columns_of, letter
 from gateway.tags import WriteRule
 from tests.sheets import plant
 

@@ -269,13 +269,13 @@ class Client:
         judge, bus, station = self.judge, self.bus, self.judge.stations[self.device.name]
         number = 255 if name == "global" else self.number
         frames, since = bus.commands[number], judge.now
-        ran, known = station.inner.running, _switched(station)  # type: ignore[attr-defined]
+        ran, known = station.inner.link.running, _switched(station)  # type: ignore[attr-defined]
         outcome = await _said(lambda: judge.gateway.control(self.device.name, name, argument))
         sent = bus.commands[number] - frames
         bus.note("command", self.device.name, name, str(outcome), sent)
         judge.story.counts[f"command {name}"] += 1
         obeyed = _switched(station) - known
-        runs = station.inner.running  # type: ignore[attr-defined]
+        runs = station.inner.link.running  # type: ignore[attr-defined]
         match name, outcome:
             case _, BadValue():  # another client may send `global` at the same time
                 true = argument in ("no\x01", "maybe") and (sent == 0 or name == "global")

@@ -217,9 +217,9 @@ class Expectations:
         groups = self.judge.story.pace == "groups"  # of all tags of each device
         if requests > sum(len(device.tags) if groups else 4 for device in engine.devices):
             broke(f"{name}: {requests} requests wait")
-        frames = engine._unsolicited
-        if isinstance(frames, UnsolicitedFrames) and (replies := len(frames._replies)) > 4:
-            broke(f"{name}: {replies} replies wait")
+        for frames in engine.rules.all:
+            if isinstance(frames, UnsolicitedFrames) and (replies := len(frames._replies)) > 4:
+                broke(f"{name}: {replies} replies wait")
 
     def _look_at_ages(self) -> None:
         """No good value is older than a bound, which is above that of the gateway."""

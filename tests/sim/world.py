@@ -21,7 +21,7 @@ import structlog
 from gateway.config import LineConfig, load
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device_settings import DeviceSettings
-from gateway.engine.results.shorter_silences import Pace
+from gateway.engine.results.shorter_silences import Pace, ShorterSilences
 from gateway.plant.plant import Plant
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
@@ -206,14 +206,16 @@ class World:
         """Lets most lines try shorter silences although they have time, and after few replies."""
         chance = random.Random(f"silence {self.story.seed}")
         for line in self.gateway.lines:
-            shorter = line.engine._next_job.shorter  # private: no setting of the file
-            usual = shorter.pace
-            shorter.pace = Pace(
-                chance.choice((0.0, 0.0, usual.needed)),
-                chance.choice((3, 10, usual.proof)),
-                chance.choice((1.0, 10.0, usual.pause)),
-            )
-            shorter.look_at = min(shorter.look_at, shorter.pace.proof)
+            for shorter in line.engine.rules.all:
+                if not isinstance(shorter, ShorterSilences):
+                    continue
+                usual = shorter.pace  # no setting of the file
+                shorter.pace = Pace(
+                    chance.choice((0.0, 0.0, usual.needed)),
+                    chance.choice((3, 10, usual.proof)),
+                    chance.choice((1.0, 10.0, usual.pause)),
+                )
+                shorter.look_at = min(shorter.look_at, shorter.pace.proof)
 
     def _twin(self, name: str) -> Troubled:
         """Makes a second PLC with the number of this device, and other values."""

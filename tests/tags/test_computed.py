@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gateway.config import ConfigErrors, load
-from gateway.config.formulas import parse
+from gateway.config.tags.formulas import parse
 from gateway.tags import Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.formula import Formula
 from gateway.tags.mirror import Mirror

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from gateway.config.parsers import every_digit
+from gateway.config.settings.parsers import every_digit
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.driver import Unit
 from gateway.tags import Tag

@@ -295,3 +295,25 @@ def test_scale_and_offset_are_exact(
 ) -> None:
     found = rule(**settings).value(known, whole=whole)
     assert (found, type(found)) == (carried_value, type(carried_value))
+
+
+def test_a_filled_value_lapses_once_with_its_source_and_is_carried_again() -> None:
+    one = Row(rule(), 0.0, fills=True)
+    starting = Reading(None, float("inf"), Reason.STARTING)
+    assert one.lapse(starting) is None
+    assert carried(one, 5, 1.0) == Carry(5, within=5.0)
+    assert one.lapse(BAD) is None  # the write is under way
+    one.ended(DONE, 1.1)
+    assert one.lapse(good(5, age=4.9)) is None
+    assert one.wake(1.2) < 2.0  # the age is looked at, although nothing is to be carried
+    found = one.lapse(good(5, age=5.0))
+    assert found is not None
+    assert found.why == "the last read of a/x is older than 5 s"
+    assert one.lapse(BAD) is None
+    assert one.next(good(5), 9.0) == Carry(5, within=5.0)
+    one.ended(DONE, 9.1)
+    assert one.lapse(BAD) is not None
+    for other in (row(), Row(rule(substitute=0), 0.0, fills=True)):
+        assert carried(other, 5, 1.0) is not None
+        other.ended(DONE, 1.1)
+        assert other.lapse(BAD) is None

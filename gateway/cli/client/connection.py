@@ -15,7 +15,7 @@ from gateway.cli.client.client import Client
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.address import Address, address
 from gateway.errors import ConfigError, GatewayError
-from gateway.northbound.session.session_settings import configure
+from gateway.northbound.session.session_settings import configure, reachable
 
 if TYPE_CHECKING:
     from gateway.config import Config
@@ -78,15 +78,10 @@ def _endpoints(config: "Config | Address") -> tuple[str, ...]:
     own = config.zenoh
     if own.mode == "client":
         return own.connect
-    here = tuple(_reachable(endpoint) for endpoint in own.listen)
+    here = tuple(reachable(endpoint) for endpoint in own.listen)
     if config.standby is None:
         return here or own.connect
     return own.connect + here  # another member of the group may be active
-
-
-def _reachable(endpoint: str) -> str:
-    """Replaces the address of all interfaces by the one of this machine."""
-    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def _setup(own: ZenohConfig, endpoints: tuple[str, ...]) -> zenoh.Config:

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 import zenoh
 
 _CONNECT_TIMEOUT = 2.0  # seconds
+_ANSWER_WITHIN = 3.0  # seconds
+_NO_MESSAGE = b"\x01\x00\xff"  # Zenoh closes the link at once
+_STANDS_STILL = "takes connections and does not answer: that process stands still"
 _TLS = "transport/link/tls"
 
 
@@ -18,9 +21,9 @@ def connection_failure(
 
     `hint` explains how to give a user name, for a client without one (`user` is None).
     """
-    refused = f"refuses the user {user}: the name or password is wrong, or the gateway hangs"
+    refused = f"refuses the user {user}: the name or password is wrong"
     if user is None:
-        refused = f"requires a name and password, or hangs: {hint}"
+        refused = f"requires a name and password: {hint}"
     sentences = [
         f"{endpoint} {fault or refused}"
         for endpoint in endpoints
@@ -32,7 +35,7 @@ def connection_failure(
 
 
 def _fault(endpoint: str, setup: zenoh.Config) -> str | None:
-    """Returns the fault of the certificate, "" for none, None when the endpoint is closed."""
+    """Returns what is wrong, "" for nothing, None when the endpoint is closed."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     host = host.strip("[]")
@@ -43,18 +46,33 @@ def _fault(endpoint: str, setup: zenoh.Config) -> str | None:
     except OSError:
         return None
     with link:
-        return _certificate_fault(link, host, setup) if protocol == "tls" else ""
+        link.settimeout(_ANSWER_WITHIN)
+        return _tls_fault(link, host, setup) if protocol == "tls" else _silence(link)
 
 
-def _certificate_fault(link: socket.socket, host: str, setup: zenoh.Config) -> str:
+def _silence(link: socket.socket) -> str:
+    """Returns a sentence if no answer comes, not even the end of the link."""
+    try:
+        link.sendall(_NO_MESSAGE)
+        link.recv(1)
+    except TimeoutError:
+        return _STANDS_STILL
+    except OSError:  # closed
+        pass
+    return ""
+
+
+def _tls_fault(link: socket.socket, host: str, setup: zenoh.Config) -> str:
     try:
         with _context(setup).wrap_socket(link, server_hostname=host):
             return ""
+    except TimeoutError:
+        return _STANDS_STILL
     except ssl.SSLCertVerificationError as error:
         return f"has an untrusted certificate: {error.verify_message}"
     except ssl.SSLError as error:
         return f"fails the TLS handshake: {error.reason}"
-    except OSError:  # no reply, or closed
+    except OSError:  # closed
         return ""
 
 

@@ -30,6 +30,7 @@ ANSWERS_TWICE = (
     "Answers twice: a second master is on the line, two stations have the number {station}, or a "
     "device server repeats replies"
 )
+ECHO_PROVEN_FOR = 2.0  # seconds after which an adapter may echo that did not before
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
 
 
@@ -110,6 +111,16 @@ class Device:
         """Seconds of the station for a reply, measured or from the file; None: not known yet."""
         measured, given = self.record.turnaround, self.turnaround.configured
         return given if measured is None else max(measured, given or 0.0)
+
+    def may_be_echo(self, turnaround: float, unproven: float) -> bool:
+        """Returns True if a reply that equals its request may be its echo, although the adapter
+        did not echo before.
+
+        It came sooner than the device ever replied, or no other reply has come without an echo for
+        so long. `turnaround`: of the reply; `unproven`: since then.
+        """
+        quickest = min(self.record.quickest, self.usual_turnaround or 0.0)
+        return unproven > ECHO_PROVEN_FOR or turnaround < quickest / 2
 
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""

@@ -196,6 +196,11 @@ class Health:
         self._probe_token += 2
         return self._probe_token
 
+    @property
+    def spare_token(self) -> int:
+        """The token for a second resync request after the last token."""
+        return self._probe_token + 1
+
     def resyncs_elsewhere(self) -> None:
         """Notes that resyncs have other spans from now on. Their replies are told apart from those
         to earlier resyncs no longer, so that the line settles after the first reply."""

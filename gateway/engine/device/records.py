@@ -1,5 +1,6 @@
 """Counts of lines, devices and polls since the start."""
 
+import math
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -10,6 +11,7 @@ COMPLETE, MODEM_LOST = "complete", "modem lost"  # results of calls, beside the 
 DAY = 86_400.0  # seconds
 MOST_FALLS = 1000  # times that are kept: one each 86 s of a day
 LATELY = 32  # requests whose ends are kept
+QUICKEST_OF = 50  # exchanges
 MOST_RESULTS = 20  # a modem that says noise does not fill the memory
 
 
@@ -151,6 +153,9 @@ class Record:
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
     refusals: Counter[str] = field(default_factory=Counter)  # by the code of the device
     turnaround: float | None = None  # measured
+    quickest: float = math.inf  # of many recent exchanges
+    _quickest_now: float = math.inf  # of those that are counted at present
+    _counted: int = 0
     slowest_write: float = 0.0
 
     def count_exchanges(self, exchanges: int, characters: float, turnarounds: float) -> None:
@@ -162,6 +167,11 @@ class Record:
             own, known = turnarounds / exchanges, self.turnaround
             # Smoothed over about ten exchanges.
             self.turnaround = own if known is None else known + 0.1 * (own - known)
+            if own < self._quickest_now:
+                self._quickest_now = own
+            self._counted += 1
+            if self._counted >= QUICKEST_OF:
+                self.quickest, self._quickest_now, self._counted = self._quickest_now, math.inf, 0
 
     def count_write(self, took: float) -> None:
         self.writes += 1

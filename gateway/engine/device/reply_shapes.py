@@ -32,6 +32,7 @@ class ReplyShapes:
         "_driver",
         "_mark",
         "_refused",
+        "_told_all_until",
         "_used",
         "at",
         "extra_at",
@@ -54,6 +55,7 @@ class ReplyShapes:
         self.mark_due = 0.0  # when a resync must show the order, if the wire is not quiet before
         self.extra_at = -NEVER  # when an extra reply arrived
         self._refused = -NEVER  # when the last error reply arrived
+        self._told_all_until = -NEVER  # until then a reply to a broadcast may arrive
         self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
         self._mark = MARK_FIRST
         self._driver = driver
@@ -124,6 +126,8 @@ class ReplyShapes:
 
         `shape` of the expected reply; None: unknown.
         """
+        if now < self._told_all_until:
+            return True
         acked, at = self._acked
         alike = shape == acked or shape is None or acked is None
         return (alike and now - at < self.quiet) or now - self._refused < self.quiet
@@ -135,6 +139,10 @@ class ReplyShapes:
     def refused(self, now: float) -> None:
         """Notes an error reply."""
         self._refused = now
+
+    def told_all(self, until: float) -> None:
+        """Notes a broadcast, to which the station may reply until then."""
+        self._told_all_until = until
 
     def marked(self, now: float) -> None:
         """Notes a resync: its reply shows that no extra reply is waiting."""

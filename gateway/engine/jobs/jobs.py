@@ -193,7 +193,8 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
                 span, reads = job.run, needs_read(job.writes)
                 units = together(span, job.writes, [0] * span.size)
             before, after = shapes.written(span, units, reads, now)
-            write.resync(token() if before else None, token() if after else None)
+            resyncs = (token() if before else None, token() if after else None)
+            write.resync(*resyncs, device.health.spare_token)
             if (long := write.long) is not None and not shapes.tells_apart(long, units):
                 long.resync_each([token() for _ in long.spans])
             return
@@ -220,6 +221,7 @@ class Traffic:
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
     silence: float = math.inf  # seconds before its request, the shortest of several
+    doubtful: bool = False  # an acknowledgement may be the echo of its request
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,6 +45,7 @@ class Resyncs(NamedTuple):
 
     before: int | None = None
     after: int | None = None
+    spare: int | None = None  # of the resync after a reply that may be the echo of the request
 
 
 NO_RESYNCS = Resyncs()
@@ -89,9 +90,9 @@ class Write:
         """The time after which it is not sent, because the client no longer waits."""
         return self.submitted + self.within
 
-    def resync(self, before: int | None, after: int | None) -> None:
+    def resync(self, before: int | None, after: int | None, spare: int) -> None:
         """Has resyncs with these tokens sent around it."""
-        self.resyncs = Resyncs(before, after)
+        self.resyncs = Resyncs(before, after, spare)
 
     def send_alone(self) -> None:
         """Notes that none of the writes that it shared a request with was done."""

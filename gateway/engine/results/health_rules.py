@@ -40,7 +40,7 @@ class HealthRules:
             self._effects.info("device online", line=self._line, device=device.name)
             device.bad_addresses.abandon()
             self._schedule.came_online(device, now)
-            self._staleness.look(now, time)
+            self._staleness.tick(now, time)
 
     def unclear(
         self, device: Device, error: DeviceError, asked: Span | None, now: float, time: int
@@ -55,7 +55,7 @@ class HealthRules:
             self._effects.debug("transaction failed", line=self._line, device=name, why=why)
             return before
         self._effects.info("transaction failed", line=self._line, device=name, why=why)
-        self._staleness.look(now, time)
+        self._staleness.tick(now, time)
         return before
 
     def settled(

@@ -11,6 +11,7 @@ from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import Idle
 from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.rule import Rule
 from gateway.errors import Evidence, Garbled, Unclear
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.listening import Asked, Learn, Listenable, Noise, Pairing, Told
@@ -108,13 +109,15 @@ class _Read:
         return () if self._decoder is None else self._decoder.first(units, time)
 
 
-class Listening:
+class Listening(Rule):
     """Takes the place of `UnsolicitedFrames` on a listen-only line."""
+
+    due = math.inf  # when `tick` must be called
 
     def __init__(
         self, devices: Sequence[Device], wire: WireTiming, results: HealthRules, effects: Effects
     ) -> None:
-        self.speakers = devices
+        self._speakers = devices
         self._results = results
         self._effects = effects
         self._character = wire.character
@@ -124,21 +127,23 @@ class Listening:
         self._timeout = max(one.timing.reply_timeout for one in devices)
         self._last = -math.inf  # when bytes arrived
         self._heard: dict[Tag, float] = {}  # when; a tag that is stale already is missing
-        self.due = math.inf  # when `tick` must be called
         self.opened(0.0)
 
     def opened(self, now: float) -> None:
         """Starts to listen, perhaps in the middle of a frame."""
-        devices = self.speakers
+        devices = self._speakers
         self._last = now
         self._ear = self._stations[devices[0].driver.station].driver.ear(self._character)
         self._pairing = Pairing(max(one.longest_reply for one in devices), self._character)
         self._heard = {tag: now for one in devices for tag in one.tags}
         self._look()
 
-    def change(self, changes: Changes, now: float) -> None:
+    def applies(self, devices: Sequence[Device]) -> bool:
+        return bool(self._speakers)
+
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         """Stops listening: the line is closed, and perhaps opened again for other devices."""
-        self.speakers = ()
+        self._speakers = ()
         self._heard.clear()
         self.due = math.inf
 
@@ -219,12 +224,6 @@ class Listening:
     def _look(self) -> None:
         self.due = min((at + stale_after(tag) for tag, at in self._heard.items()), default=math.inf)
 
-    def next(self, now: float) -> Idle:
+    def first(self, now: float) -> Idle:
         """Returns no job, whatever is due: this line sends nothing."""
         return Idle(math.inf)
-
-    def unmatched(self, device: Device, frame: Any, now: float, time: int) -> None:
-        """No transaction ever runs."""
-
-    def transaction_ended(self, device: Device, now: float, *, sent: int, heard: int) -> None:
-        """No transaction ever runs."""

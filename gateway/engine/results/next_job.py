@@ -1,6 +1,5 @@
 """Applies the result of a job that is no good read, and decides what follows it."""
 
-from gateway.engine.device.changes import Changes
 from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import (
@@ -23,11 +22,8 @@ from gateway.engine.jobs.jobs import (
 )
 from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.results.health_rules import HealthRules
-from gateway.engine.results.line_silence import LineSilence
-from gateway.engine.results.pipelining import Pipelining
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.request_rules import RequestRules
-from gateway.engine.results.shorter_silences import ShorterSilences
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
@@ -49,14 +45,10 @@ class NextJob:
         results: HealthRules,
         polls: PollRules,
         requests: RequestRules,
-        shorter: ShorterSilences,
         effects: Effects,
         gap: float,
     ) -> None:
         """`gap`: seconds without a byte that end a run of noise."""
-        self.silence = LineSilence()
-        self.shorter = shorter
-        self.pipelining = Pipelining(effects)
         # An earlier process may have left requests in a device server, until the wire was quiet.
         self.inherits = False
         self._in_flight = in_flight
@@ -70,18 +62,8 @@ class NextJob:
         """Notes that a device server may have kept requests of an earlier process."""
         self.inherits = True
 
-    def change(self, changes: Changes, now: float) -> None:
-        """Takes over changed devices."""
-        self.shorter.change(now)
-        for device in changes.added:  # its station may be that of a device before
-            device.health.inherit()
-        for device in changes.left:
-            self.pipelining.forget(device)
-
     def poll_failed(self, poll: PollEntry, result: Exception, now: float, time: int) -> None:
         """Applies the result of a poll without units."""
-        if self.silence.noted:
-            self.silence.concluded(result)
         device, results = poll.device, self._results
         match result:
             case Refused():
@@ -97,22 +79,15 @@ class NextJob:
             case _:
                 raise result
 
-    def polls_ended(self, last: Poll, traffic: Traffic, now: float, time: int) -> None:
-        """Applies the end of a transaction of polls, some of which failed or were together."""
-        failed = self._in_flight.failed
-        if last.device.window > 1:
-            polls = [poll.job for poll, _ in failed]
-            self.pipelining.concluded(last, self._in_flight.together, polls, now)
-        if failed:
-            first, error = failed[0]
-            self.unclear(first.job, error, traffic, now, time)
+    def polls_ended(self, traffic: Traffic, now: float, time: int) -> None:
+        """Applies the end of a transaction of polls, some of which failed."""
+        first, error = self._in_flight.failed[0]
+        self.unclear(first.job, error, traffic, now, time)
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         """Applies the result of a job that is no poll."""
-        if self.silence.noted:
-            self.silence.concluded(result)
         match job:
             case Settle():
                 self._settled(job, result, now, time)
@@ -167,8 +142,6 @@ class NextJob:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
-        if traffic.sent and not device.broadcast:  # only polled devices must reply
-            self.silence.unanswered(error, self._in_flight.begun)
         before = self._results.unclear(device, error, span_of(job), now, time)
         no_guard = before is State.OFFLINE or _is_short(job)
         settle = Settle(

@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.jobs.jobs import Poll, Result, Traffic, Transacted
+from gateway.engine.results.rule import Rule
+from gateway.engine.schedule.in_flight import InFlight
+from gateway.errors import Unclear, Unsteady
 from gateway.protocols.driver import Span
 
 PROOFS = 3  # requests that were answered alone and not beside others
@@ -38,7 +42,7 @@ class _Window:
         self.apart_until = until
 
 
-class Pipelining:
+class Pipelining(Rule):
     """Decides how many polls of a device share a transaction.
 
     A poll without a reply beside others is polled alone. A reply then proves that the device lost
@@ -46,15 +50,23 @@ class Pipelining:
     Until then no other polls share a transaction: one more loss may take the device offline.
     """
 
-    def __init__(self, effects: Effects) -> None:
+    def __init__(self, in_flight: InFlight, effects: Effects) -> None:
+        self._in_flight = in_flight
         self._effects = effects
+        self._failed: list[Poll] = []  # of the present transaction
         self._windows: dict[Device, _Window] = {}
 
-    def forget(self, device: Device) -> None:
-        """Forgets a device that the line no longer has."""
-        self._windows.pop(device, None)
+    def applies(self, devices: Sequence[Device]) -> bool:
+        return any(device.window > 1 for device in devices)
 
-    def others(self, poll: Poll, now: float) -> int:
+    def opened(self, now: float) -> None:
+        self._failed.clear()
+
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
+        for device in changes.left:
+            self._windows.pop(device, None)
+
+    def beside(self, poll: Poll, now: float) -> int:
         """Returns how many polls may be sent beside this one."""
         window = self._windows.get(poll.device)
         if window is not None:
@@ -65,7 +77,19 @@ class Pipelining:
                 return 0
         return poll.device.window - 1
 
-    def concluded(self, poll: Poll, count: int, failed: Sequence[Poll], now: float) -> None:
+    def concluded(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        """Takes the results of the polls of a transaction, until the last one has ended."""
+        if not isinstance(job, Poll) or job.device.window == 1:
+            return
+        if isinstance(result, Unclear) and not isinstance(result, Unsteady):
+            self._failed.append(job)
+        if len(self._in_flight.open) == 1:
+            failed, self._failed = self._failed, []
+            self._ended(job, self._in_flight.together, failed, now)
+
+    def _ended(self, poll: Poll, count: int, failed: Sequence[Poll], now: float) -> None:
         """Takes the end of a transaction with `count` polls, of which `poll` was the last."""
         device = poll.device
         window = self._windows.get(device)

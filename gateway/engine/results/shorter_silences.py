@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Hashable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.station_silence import MOST_DOUBLED
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import Idle, Job, Poll, Reopen, Result, Traffic, Transacted
+from gateway.engine.results.rule import Rule
+from gateway.engine.results.unsolicited import speaks
+from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import Garbled, NoReply, Refusal, Refused
-from gateway.protocols.unsolicited import Unsolicited
 
 PROOF = 50  # replies for each station at one step, without a loss, before the next step
 HELD = 10_000  # replies at the last step after which earlier losses count no more
@@ -26,7 +29,7 @@ class Pace(NamedTuple):
     pause: float = PAUSE
 
 
-class ShorterSilences:
+class ShorterSilences(Rule):
     """The silences of one line, between a reply and the next poll.
 
     A station may need a silence for two reasons. It still drives the pair after its own reply: this
@@ -44,25 +47,10 @@ class ShorterSilences:
     repeated poll, and none whose reply could not be told from a copy of the reply before.
     """
 
-    __slots__ = (
-        "_devices",
-        "_effects",
-        "_held",
-        "_learning",
-        "_line",
-        "_losses",
-        "_next",
-        "_shape",
-        "answered",
-        "look_at",
-        "pace",
-        "spoke",
-        "step",
-        "suspects",
-    )
-
-    def __init__(self, line: str, devices: Sequence[Device], effects: Effects) -> None:
-        self._line, self._effects = line, effects
+    def __init__(
+        self, line: str, devices: Sequence[Device], in_flight: InFlight, effects: Effects
+    ) -> None:
+        self._line, self._in_flight, self._effects = line, in_flight, effects
         self._devices = devices
         self._learning = _learning(devices)
         self.pace = Pace()
@@ -77,10 +65,16 @@ class ShorterSilences:
         self._next = -math.inf  # when the next step may be taken
         self._shape: Hashable = None  # of the last reply to a poll; None: unknown
 
-    def before(self, job: Job, entry: PollEntry | None) -> None:
-        """Sets the silence before the requests of the job. Called at every step but the first."""
-        if isinstance(job, Idle | Reopen):
+    def applies(self, devices: Sequence[Device]) -> bool:
+        return bool(_learning(devices))
+
+    def before(self, job: Job, now: float) -> None:
+        """Sets the silence before the requests of the job."""
+        if self.suspects:
+            self.judge(now)
+        if not self.step or isinstance(job, Idle | Reopen):
             return
+        entry = self._in_flight.open.get(job) if isinstance(job, Poll) else None
         device, spoke = job.device, self.spoke
         silence = device.silence
         silence.keep_safe(at_rest=False)
@@ -92,7 +86,9 @@ class ShorterSilences:
         if spoke is not None and not copied and _may_be_lost(entry):
             silence.keep(max(silence.shorter, spoke.silence.shorter))
 
-    def concluded(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
+    def concluded(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
         """Counts the polls at this step, and notes the station that spoke last."""
         if isinstance(job, Poll):
             device = job.device
@@ -171,8 +167,17 @@ class ShorterSilences:
             self._pause(now)
         self.suspects = None
 
-    def disturbed(self, now: float) -> None:
-        """Takes bytes that answer no request: a silence lets them pass."""
+    def received(self, data: bytes, now: float, time: int) -> None:
+        """Takes bytes that answer no request."""
+        self._disturbed(now)
+
+    def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
+        """Takes a frame that answers no request."""
+        if not echo:
+            self._disturbed(now)
+
+    def _disturbed(self, now: float) -> None:
+        """Restores the silences: they let such bytes pass."""
         self.answered = 0
         if self.step:
             self._restore("bytes arrived that answer no request", now)
@@ -184,7 +189,7 @@ class ShorterSilences:
         if self.step:
             self._restore("the port was opened", now)
 
-    def change(self, now: float) -> None:
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         """Takes over changed devices of the line, which are in `devices` already."""
         self.suspects = self.spoke = self._shape = None
         if self.step:
@@ -209,7 +214,7 @@ class ShorterSilences:
 
 def _learning(devices: Sequence[Device]) -> list[Device]:
     """Returns the devices whose silences may be shortened."""
-    if any(isinstance(d.driver, Unsolicited) and d.driver.sends_unsolicited for d in devices):
+    if any(map(speaks, devices)):
         return []  # the silence lets their frames begin
     return [device for device in devices if device.silence.learns]
 

@@ -7,6 +7,7 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
+from gateway.engine.results.rule import NEVER, Rule
 from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.planning.planner import describe
@@ -14,10 +15,9 @@ from gateway.tags import Reason
 
 LOG_EVERY = 60.0  # seconds for each device
 CAUSE = "others on the line, or writes, take its time"
-NEVER = float("inf")
 
 
-class Staleness:
+class Staleness(Rule):
     """Limits the age of the values of one line.
 
     A value of a failing device turns bad after two intervals. All others turn bad at twice the
@@ -25,8 +25,9 @@ class Staleness:
     be dead. In either case the longest wait for one reply is added.
     """
 
+    due = NEVER  # when `tick` must be called again
+
     def __init__(self, schedule: Schedule, effects: Effects) -> None:
-        self.due = NEVER  # when `look` must be called again
         self._schedule = schedule
         self._effects = effects
         self._plan: list[tuple[Device, Sequence[PollEntry], float | None]] = []
@@ -41,12 +42,12 @@ class Staleness:
             soonest = min((limit for _, limit in self._limits()), default=NEVER)
             self.due = min(self.due, now + soonest)
 
-    def stop(self) -> None:
-        """Stops, because the line is closed and all its values are bad."""
+    def closed(self) -> None:
+        """Stops: all values of the line are bad."""
         self.due = NEVER
 
-    def look(self, now: float, time: int) -> None:
-        """Turns values bad that are too old. `time`: ns since 1970."""
+    def tick(self, now: float, time: int) -> None:
+        """Turns values bad that are too old."""
         self.due = NEVER
         for poll, limit in self._limits():
             if poll.reads.at is None:

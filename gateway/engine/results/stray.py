@@ -7,6 +7,8 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.listening import listens
+from gateway.engine.results.rule import Rule
 from gateway.errors import Garbled
 from gateway.protocols.capabilities import StrayFrames, UnnumberedReplies
 from gateway.protocols.driver import Codec
@@ -15,7 +17,7 @@ LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level de
 PAUSE = 0.1  # seconds without a byte after which a frame begins
 
 
-class Stray:
+class Stray(Rule):
     """Counts and logs frames of one line that are no reply to any request.
 
     Another master may have sent them and changed the monitor list of a PLC. So the line registers
@@ -34,7 +36,10 @@ class Stray:
         self._last = float("-inf")
         self._logged: dict[Device, float] = {}
 
-    def change(self, changes: Changes) -> None:
+    def applies(self, devices: Sequence[Device]) -> bool:
+        return not listens(devices)  # the frames there are those of another master
+
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         """Takes over changed devices of the line, which are in `devices` already."""
         self._readers = _readers(self._devices)
         for device in changes.left:

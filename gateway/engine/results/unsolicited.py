@@ -8,8 +8,9 @@ from typing import Any
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
-from gateway.engine.jobs.jobs import Answer, Idle
+from gateway.engine.jobs.jobs import Answer, Idle, Result, Traffic, Transacted
 from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.rule import NEVER, Rule
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.unsolicited import (
     Stale,
@@ -23,7 +24,6 @@ from gateway.tags import Reason, Tag, of_field
 REPLY_WITHIN = 1.0  # seconds; after that the device no longer waits
 MOST_REPLIES = 16  # waiting
 HELD_FOR = 1.0  # seconds that an incomplete frame may hold up the line
-NEVER = float("inf")
 
 
 @dataclass(slots=True, eq=False)
@@ -61,7 +61,13 @@ def _senders(device: Device, now: float) -> list[_Sender]:
     return [_Sender(device, driver.listener(now), driver.unsolicited)]
 
 
-class UnsolicitedFrames:
+def speaks(device: Device) -> bool:
+    """Returns True for a device that sends unsolicited frames."""
+    driver = device.driver
+    return isinstance(driver, Unsolicited) and driver.sends_unsolicited
+
+
+class UnsolicitedFrames(Rule):
     """The listeners of one line: one for each device that sends unsolicited frames."""
 
     def __init__(self, devices: Sequence[Device], results: HealthRules, effects: Effects) -> None:
@@ -72,13 +78,16 @@ class UnsolicitedFrames:
         self._replies: deque[Answer] = deque(maxlen=MOST_REPLIES)
         self._held_since: float | None = None
 
+    def applies(self, devices: Sequence[Device]) -> bool:
+        return any(map(speaks, devices))
+
     def opened(self, now: float) -> None:
         """Starts the listeners. The port may have been opened in the middle of a frame."""
         self._replies.clear()
         self._held_since = None
         self.speakers = [sender for one in self._devices for sender in _senders(one, now)]
 
-    def change(self, changes: Changes, now: float) -> None:
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         """Takes over changed devices. A listener goes on: it knows the ages of the fields."""
         following = dict(changes.replaced)
         stay = []
@@ -98,7 +107,7 @@ class UnsolicitedFrames:
         for sender in self.speakers:
             self._apply(sender, sender.listener.received(data, now), now, time)
 
-    def unmatched(self, device: Device, frame: Any, now: float, time: int) -> None:
+    def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
         """Takes a frame that arrived in a transaction with this device and is not its reply.
 
         It can be an unsolicited frame of another device with the same framing.
@@ -107,10 +116,12 @@ class UnsolicitedFrames:
             if sender.device is device or sender.listener.framed_as(device.driver):
                 self._apply(sender, sender.listener.unmatched(frame, now), now, time)
 
-    def transaction_ended(self, device: Device, now: float, *, sent: int, heard: int) -> None:
+    def concluded(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
         """Drops incomplete frames that began before the transaction."""
         for sender in self.speakers:
-            if heard or (sent and sender.device is not device):
+            if traffic.heard or (traffic.sent and sender.device is not job.device):
                 sender.listener.restart(now)
 
     @property
@@ -125,7 +136,7 @@ class UnsolicitedFrames:
             if (due := sender.listener.due) is not None and due <= now:
                 self._apply(sender, sender.listener.tick(now), now, time)
 
-    def next(self, now: float) -> Answer | Idle | None:
+    def first(self, now: float) -> Answer | Idle | None:
         """Returns a job that precedes all others: a reply, or `Idle` during a frame."""
         while self._replies:
             reply = self._replies.popleft()

@@ -42,6 +42,13 @@ class InFlight:
         """Notes the job that must follow."""
         self.continuation = job
 
+    def ended(self, now: float, *, shared: bool) -> None:
+        """Notes that the job has ended. On a line that is shared, its device used the wire."""
+        self.job = None
+        self.failed.clear()
+        if self.charged is not None and shared:
+            self.charged.used(now, self.begun)
+
     def clear(self) -> None:
         """No job is handed out any more."""
         self.job = self.charged = self.continuation = None

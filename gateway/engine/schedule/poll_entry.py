@@ -66,6 +66,10 @@ class PollEntry:
         """Makes it due at `when` at the latest."""
         self.due = min(self.due, when)
 
+    def put_off(self, when: float) -> None:
+        """Makes it due at `when` at the earliest: its device is left alone until then."""
+        self.due = max(self.due, when)
+
     def hasten(self, deadline: float) -> None:
         """Gives it an earlier deadline; `inf`: that of its interval."""
         self.soon = deadline

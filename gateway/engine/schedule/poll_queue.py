@@ -106,6 +106,14 @@ class PollQueue:
             poll.queue(NOT_QUEUED)
             self.push(poll)
 
+    def put_off(self, poll: PollEntry, when: float) -> None:
+        """Has the poll wait until `when`."""
+        if poll.ticket <= EXPEDITED:
+            self.expedited.remove(poll)
+            poll.queue(NOT_QUEUED)
+        poll.put_off(when)
+        self.push(poll)
+
     def ripen(self, now: float) -> bool:
         """Moves polls that became due, and finds the first. Returns True if one can be sent."""
         waiting, expedited = self.waiting, self.expedited

@@ -1,7 +1,7 @@
 """Decides the next job of one line."""
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from gateway.engine.device.block_reads import BlockReads
 from gateway.engine.device.changes import Changes
@@ -198,10 +198,15 @@ class Schedule:
 
     # The next job
 
-    def next(self, now: float) -> Request | Probe | PollEntry | Idle:
+    def next(
+        self, now: float, free: Callable[[Device, float], float] | None = None
+    ) -> Request | Probe | PollEntry | Idle:
+        """Returns the next job. `free`: when a device may be polled; None: all may be at once."""
         if now >= self._on_demand_at or self._queue.expedited:
             self._share_on_demand(now)
         due = self._queue.ripen(now)
+        while due and free is not None and self._held(free, now):
+            due = self._queue.ripen(now)
         waiting = self._queue.waiting
         until = waiting[0][0] if waiting else NEVER
         if due and self._queue.due is None and not self._may_expedite(now, until):
@@ -220,6 +225,15 @@ class Schedule:
                 return probe
             until = min(until, probe)
         return self._next_poll(now) if due else Idle(until)
+
+    def _held(self, free: Callable[[Device, float], float], now: float) -> bool:
+        """Returns True if a poll that goes first is put off, because its device is left alone."""
+        queue = self._queue
+        for poll in (queue.due, queue.expedited[0] if queue.expedited else None):
+            if poll is not None and (when := free(poll.device, now)) > now:
+                queue.put_off(poll, when)
+                return True
+        return False
 
     def _share_on_demand(self, now: float) -> None:
         """Charges the poll on demand that has ended: others wait three times as long."""

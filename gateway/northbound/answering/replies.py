@@ -135,9 +135,8 @@ class Replies:
                     self._samples(query, past.one_by_one(by_tag), pause)
                 elif tags:
                     wanted = {tag.key: tag for tag in tags}
-                    size, after = page or (None, None)
-                    place = pages.recorded_place(after)
-                    recorded = RecordedQuery(wanted, asked.time_range, place, size, now)
+                    place = pages.recorded_place(None if page is None else page.after)
+                    recorded = RecordedQuery(wanted, asked.time_range, place, now)
                     found = history.as_recorded(recorded, pause)
                     self._as_recorded(query, found, page, pause, only_good=asked.only_good)
         except GatewayError as error:

@@ -30,7 +30,8 @@ class _Link:
 
 
 class LinkMonitor:
-    """Sets `returned` when a router, or a session that may have been linked before, is linked."""
+    """Sets `returned` when a router, or a session that may have been linked before, is linked, and
+    `router_lost` when a peer has lost a router."""
 
     def __init__(
         self, *, is_peer: bool = False, clock: Callable[[], float] = time.monotonic
@@ -40,6 +41,7 @@ class LinkMonitor:
         self._is_peer = is_peer
         self._clock = clock
         self.returned = asyncio.Event()
+        self.router_lost = asyncio.Event()
         self._up: dict[str, _Link] = {}  # by the id of the linked session
         self._lost: dict[str, None] = {}  # ids of unlinked sessions, oldest first
         self._started = _NEVER
@@ -76,6 +78,8 @@ class LinkMonitor:
             return
         if (link := self._up.pop(session, None)) is not None:
             self._log_down(session, link)
+            if link.kind == "router" and self._is_peer:
+                self.router_lost.set()
         self._lost[session] = None
         if len(self._lost) > _MOST_LOST:
             del self._lost[next(iter(self._lost))]

@@ -7,7 +7,8 @@ from pathlib import Path
 import zenoh
 
 from gateway import files
-from gateway.config import TlsConfig, ZenohConfig, ZenohMode, parsers
+from gateway.config import TlsConfig, ZenohConfig, ZenohMode
+from gateway.config.settings import parsers
 from gateway.contract import secrets
 from gateway.errors import ConfigError
 from gateway.northbound.session.exposures import describe_error
@@ -99,12 +100,17 @@ def as_client(config: zenoh.Config) -> zenoh.Config:
     return copy
 
 
-def connect_endpoints(config: zenoh.Config) -> list[str]:
-    """Returns the endpoints that the session connects to, for people."""
-    found = json.loads(config.get_json("connect/endpoints"))
+def reachable(endpoint: str) -> str:
+    """Replaces the address of all interfaces by the one of this machine."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def endpoints(config: zenoh.Config, side: str) -> list[str]:
+    """Returns the endpoints to `listen` at or to `connect` to, without their settings."""
+    found = json.loads(config.get_json(f"{side}/endpoints"))
     if isinstance(found, dict):  # by mode
         found = found.get(json.loads(config.get_json("mode")), [])
-    return [str(endpoint).partition("#")[0] for endpoint in found]
+    return [str(endpoint).partition("#")[0] for endpoint in found or ()]
 
 
 def _from_file(path: Path) -> zenoh.Config:
@@ -148,7 +154,7 @@ def _tls(tls: TlsConfig | None) -> dict[str, object]:
 def _users(settings: ZenohConfig) -> dict[str, object]:
     found: dict[str, object] = {}
     if settings.users_file is not None:
-        secrets.check_users(settings.users_file)
+        secrets.users(settings.users_file)
         found["transport/auth/usrpwd/dictionary_file"] = str(settings.users_file)
     if settings.user is not None:
         password = secrets.password(settings.password_file)

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from heapq import merge
-from itertools import chain
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -29,11 +28,11 @@ _TIME = itemgetter(0)
 
 
 class _Part(NamedTuple):
-    """Steps of one run, in lists. `last`: no step is later."""
+    """Steps of one run. `last`: no step is later."""
 
     first: int
     last: int
-    steps: Callable[[], Iterator[list[Step]]]
+    steps: Callable[[], list[Step]]
 
 
 class Course:
@@ -132,25 +131,33 @@ class _Look(NamedTuple):
 
     def _stored(self, time: int, *, later: bool) -> list[Step]:
         """Returns the steps in the file at the nearest time; a gap if they may be lost."""
+        nearest: list[Step] = []
+        for run in self._by_distance(time, later=later):
+            if nearest and (run.first > nearest[0][0] if later else run.last < nearest[0][0]):
+                break
+            period = TimeRange(time + 1, LATEST) if later else TimeRange(EARLIEST, time - 1)
+            stored = StoredRuns(self.reader, self.damage, self.file, period)
+            found = _rows(stored, run, self.numbers, lambda: None)
+            if stored.damaged:
+                return [(time, None, DAMAGED)]
+            if found:
+                at = (min if later else max)(found, key=_TIME)[0]
+                found = [step for step in found if step[0] == at]
+                if not nearest or (at < nearest[0][0] if later else at > nearest[0][0]):
+                    nearest = found
+                elif at == nearest[0][0]:  # of steps of one time the order of recording decides
+                    nearest = nearest + found if later else found + nearest
+        return nearest
+
+    def _by_distance(self, time: int, *, later: bool) -> list[SortedRun]:
+        """Returns the runs with samples after the time, or before it; the nearest first."""
         if not self.numbers:
             return []
-        [number] = self.numbers
-        try:
-            found = self.reader.neighbour(
-                self.file, self.runs[-1].number, number, time, later=later
-            )
-        except Damaged:
-            return [(time, None, DAMAGED)]
-        if found is None:
-            return []
-        place, nearest = found
-        moment = TimeRange(nearest, nearest)
-        stored = StoredRuns(self.reader, self.damage, self.file, moment)
-        steps = list[Step]()
-        for run in self.runs:
-            if run.number == place:
-                steps += chain.from_iterable(_rows(stored, run, self.numbers, lambda: None))
-        return steps if steps and not stored.damaged else [(nearest, None, DAMAGED)]
+        if later:
+            runs = (run for run in self.runs if run.last > time)
+            return sorted(runs, key=lambda run: (run.first, run.number))
+        runs = (run for run in self.runs if run.first < time)
+        return sorted(runs, key=lambda run: (run.last, run.number), reverse=True)
 
 
 def _extent(run: SortedRun, runs: Sequence[SortedRun]) -> tuple[int, int]:
@@ -171,30 +178,30 @@ def _part(
     numbers: dict[int, Tag],
     pause: Pause,
 ) -> _Part:
-    def steps() -> Iterator[list[Step]]:
-        found = [*_rows(stored, run, numbers, pause)]
+    def steps() -> list[Step]:
+        found = _rows(stored, run, numbers, pause)
         if run in stored.damaged:  # no value is valid over samples that are lost
-            found = [[(max(extent[0], stored.period.first), None, DAMAGED)]]
-        yield from found
+            return [(max(extent[0], stored.period.first), None, DAMAGED)]
+        return found
 
     return _Part(*extent, steps)
 
 
-def _rows(
-    stored: StoredRuns, run: SortedRun, numbers: dict[int, Tag], pause: Pause
-) -> Iterator[list[Step]]:
-    first, last = stored.period
+def _rows(stored: StoredRuns, run: SortedRun, numbers: dict[int, Tag], pause: Pause) -> list[Step]:
+    """Returns the steps of a run in the order of time."""
+    found: list[Step] = []
     for rows in stored.rows(run, numbers):
         if rows is None:
             raise Busy("the next samples were dropped meanwhile: ask again")
-        yield [
+        found += [
             (time, value, None)
             if bad is None and kind is None and value.__class__ is float and -_MOST < value < _MOST
             else step(time, value, kind, bad)
-            for number, time, _, value, kind, bad in rows
-            if number in numbers and first <= time <= last
+            for _, _, time, value, kind, bad, _ in rows
         ]
         pause()
+    found.sort(key=_TIME)
+    return found
 
 
 def _steps_of(run: list[Sample], period: TimeRange) -> list[Step]:
@@ -204,7 +211,7 @@ def _steps_of(run: list[Sample], period: TimeRange) -> list[Step]:
 
 
 def _in_memory(steps: list[Step]) -> _Part:
-    return _Part(steps[0][0], steps[-1][0], lambda: iter([steps]))
+    return _Part(steps[0][0], steps[-1][0], lambda: steps)
 
 
 def _step_of(sample: Sample) -> Step:
@@ -224,7 +231,7 @@ def _merged(parts: Sequence[_Part]) -> Iterator[Step]:
             together.append(waiting[place])
             last = max(last, waiting[place][1].last)
             place += 1
-        steps = [chain.from_iterable(part.steps()) for _, part in sorted(together, key=_TIME)]
+        steps = [part.steps() for _, part in sorted(together, key=_TIME)]
         yield from merge(*steps, key=_TIME) if len(steps) > 1 else steps[0]
 
 

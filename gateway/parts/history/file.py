@@ -1,9 +1,8 @@
-"""The history file: an SQLite database that is written in order and sorted run by run.
+"""The history file: an SQLite database with one table of samples, in the order of recording.
 
-Samples are stored in table `recent`, in the order of arrival. A closed run moves to `sample` in
-one transaction, sorted by tag and time, at the end of that table: nothing is inserted in the
-middle, so a commit writes few pages however many tags there are, and dropping the oldest run frees
-whole pages at the beginning. Every method is one transaction.
+A sample is written once, at the end of the table: a commit writes few pages however many tags there
+are. When a run is closed, its index is written beside its time and size. Dropping the oldest run
+frees whole pages at the beginning. Every method is one transaction.
 """
 
 import os
@@ -16,22 +15,26 @@ from pathlib import Path
 
 import structlog
 
-from gateway.parts.history import sections
+from gateway.contract.timerange import LATEST
+from gateway.errors import Damaged
+from gateway.parts.history.aside import Salvaged, move
+from gateway.parts.history.index import pack
 from gateway.parts.history.lock import close_to_others, locked
 from gateway.parts.history.outcomes import Outcome, Ring
 from gateway.parts.history.recent import Extent, Identity, SortedRun
-from gateway.parts.history.rows import to_row
+from gateway.parts.history.rows import checksum, to_row, with_checksum
 from gateway.parts.history.schema import prepare
 from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 BUSY_WITHIN = 1.0  # seconds another program may hold the file
+LONGEST_INDEX = 2**16  # samples
 
 # Many rows in one statement: SQLite releases the interpreter lock for each statement, and taking it
 # again takes long when the event loop is busy.
 _INSERTS = [
-    (size, f"INSERT INTO recent VALUES {', '.join(['(?, ?, ?, ?, ?, ?, ?)'] * size)}")  # noqa: S608  (placeholders only)
+    (size, f"INSERT INTO sample VALUES {', '.join(['(?, ?, ?, ?, ?, ?, ?)'] * size)}")  # noqa: S608  (placeholders only)
     for size in (128, 16, 1)
 ]
 
@@ -56,7 +59,7 @@ class HistoryFile:
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
-            self._tags, self._last_tag, _ = sections.tags(self._database, 0)
+            self._tags, self._last_tag, _ = tags(self._database, 0)
             self.identity = identity(self._database, path)
             self._resources = undo.pop_all()
 
@@ -65,20 +68,20 @@ class HistoryFile:
 
     # -- writing --
 
-    def new_run(self) -> int:
-        """Returns a number higher than any in use."""
-        [(number,)] = self._database.execute(
-            "SELECT 1 + max(ifnull((SELECT max(run) FROM run), 0),"
-            " ifnull((SELECT max(run) FROM recent), 0))"
-        )
-        return int(number)
+    def next_number(self) -> int:
+        """Returns the number after that of the last sample."""
+        return next_number(self._database)
 
-    def store(self, run: int, start: int, samples: Sequence[Sample]) -> None:
-        """Stores samples of a run in the order of arrival; the first has number `start` in it."""
+    def store(self, number: int, samples: Sequence[Sample]) -> None:
+        """Stores samples in the order of arrival; the first gets this number."""
+        self.store_rows(number, [(sample.tag.key, *to_row(sample)) for sample in samples])
+
+    def store_rows(self, number: int, columns: Sequence[Salvaged]) -> None:
+        """Stores rows of keys and samples in their order; the first gets this number."""
         with self._transaction():
             rows = [
-                (run, n, self._tag(sample.tag.key), *to_row(sample))
-                for n, sample in enumerate(samples, start)
+                with_checksum(n, self._tag(key), sample)
+                for n, (key, *sample) in enumerate(columns, number)
             ]
             for size, insert in _INSERTS:
                 while len(rows) >= size:
@@ -88,9 +91,11 @@ class HistoryFile:
     def _tag(self, key: str) -> int:
         number = self._tags.get(key)
         if number is None:
-            number = self._tags[key] = self._last_tag = self._last_tag + 1
-            self._database.execute("INSERT OR REPLACE INTO tag VALUES (?, ?)", (number, key))
-            sections.write_tag(self._database, number, key)
+            number = self._last_tag = self._last_tag + 1
+            row = number, key, checksum((number, key))
+            self._database.execute("INSERT OR REPLACE INTO tag VALUES (?, ?, ?)", row)
+            self._database.execute("UPDATE file SET tags = ?", (number,))
+            self._tags[key] = number
         return number
 
     def store_writes(self, ring: Ring, outcomes: Sequence[Outcome], most: int) -> int:
@@ -107,36 +112,29 @@ class HistoryFile:
             )
             return self.last_write(ring)
 
-    def sort(self, run: int, now: int) -> SortedRun | None:
-        """Moves a run from `recent` to `sample`, which may hold its beginning already. Returns None
-        if `recent` has nothing of it."""
+    def close_run(self, number: int, end: int, now: int) -> SortedRun | None:
+        """Writes the index of the samples from `number` to before `end`, if there are any."""
         with self._transaction():
-            [(first, last, count)] = self._database.execute(
-                "SELECT min(time), max(time), count(*) FROM recent WHERE run = ?", (run,)
-            )
-            if not count:
+            found = self._database.execute(
+                "SELECT id, tag, time FROM sample WHERE id >= ? AND id < ? ORDER BY id",
+                (number, end),
+            ).fetchall()
+            if not found:
                 return None
-            self._database.execute(
-                "INSERT INTO sample SELECT run, tag, time, n, value, kind, bad FROM recent"
-                " WHERE run = ? ORDER BY tag, time, n",
-                (run,),
-            )
-            self._database.execute(
-                "INSERT INTO run VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET"
-                " first = min(first, excluded.first), last = max(last, excluded.last),"
-                " samples = samples + excluded.samples, closed = excluded.closed",
-                (run, first, last, count, now),
-            )
-            self._database.execute("DELETE FROM recent WHERE run = ?", (run,))
-            sections.write(self._database, run)
-            [row] = self._database.execute("SELECT * FROM run WHERE run = ?", (run,))
-        return SortedRun(*row)
+            numbers, of_tags, times = zip(*found, strict=True)
+            run = SortedRun(number, min(times), max(times), end - number, now)
+            # Without an index the samples are read all: some of them are lost.
+            is_whole = numbers == tuple(range(number, end))
+            places = pack(of_tags, times) if is_whole else b""
+            row = (*run, checksum(run[:]), places)
+            self._database.execute("INSERT OR REPLACE INTO run VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        return run
 
-    def drop(self, run: int) -> None:
+    def drop(self, run: SortedRun) -> None:
         with self._transaction():
-            self._database.execute("DELETE FROM sample WHERE run = ?", (run,))
-            sections.drop(self._database, run)
-            self._database.execute("DELETE FROM run WHERE run = ?", (run,))
+            self._database.execute("UPDATE file SET oldest = ?", (run.end,))
+            self._database.execute("DELETE FROM sample WHERE id < ?", (run.end,))
+            self._database.execute("DELETE FROM run WHERE id < ?", (run.end,))
 
     def drop_writes(self, before: int) -> None:
         """Drops some outcomes from before this time, if there are any."""
@@ -164,15 +162,23 @@ class HistoryFile:
 
     # -- content --
 
-    def sorted_runs(self) -> list[SortedRun]:
-        return sections.runs(self._database)
+    def closed_runs(self, now: int, end: int) -> list[SortedRun]:
+        """Returns the runs in their order. Closes what an earlier process left open, up to before
+        the sample `end`, and what damage has taken the row of."""
+        found = list[SortedRun]()
+        for run in [*runs_of(self._database, end)]:
+            if not run.closed:
+                try:
+                    run = self.close_run(run.number, run.end, now) or run
+                except sqlite3.DatabaseError as error:
+                    if not is_damage(error):
+                        raise
+            found.append(run)
+        return found
 
-    def unsorted_runs(self) -> dict[int, Extent]:
-        """Returns the extent of each run in `recent`."""
-        rows = self._database.execute(
-            "SELECT run, min(time), max(time), count(*) FROM recent GROUP BY run ORDER BY run"
-        )
-        return {run: Extent(*extent) for run, *extent in rows}
+    def extent(self, number: int, most: int) -> Extent:
+        """Returns the extent of at most so many samples from a number on."""
+        return extent(self._database, number, number + most)
 
     def last_write(self, ring: Ring) -> int:
         """Returns the number of the last outcome of the ring, 0 if there is none."""
@@ -221,6 +227,63 @@ def identity(database: sqlite3.Connection, path: Path) -> Identity:
     return Identity(path.stat().st_ino, mark)
 
 
+def runs_of(database: sqlite3.Connection, end: int) -> Iterator[SortedRun]:
+    """Yields the runs in their order. Samples before `end` without a run are runs that have never
+    been closed. What cannot be read may be of any time: so every query finds the damage."""
+    begin = oldest(database)
+    rows = database.execute("SELECT id, first, last, samples, closed, sum FROM run ORDER BY id")
+    known = [SortedRun(*head) for *head, total in rows if checksum(tuple(head)) == total]
+    for run in [*known, None]:
+        until = end if run is None else run.number
+        for at in range(begin, until, LONGEST_INDEX):
+            part_end = min(at + LONGEST_INDEX, until)
+            try:
+                first, last, count = extent(database, at, part_end)
+            except sqlite3.DatabaseError as error:
+                if not is_damage(error):
+                    raise
+                first, last, count = 0, LATEST, 1
+            if count:
+                yield SortedRun(at, first, last, part_end - at, 0)
+        if run is not None:
+            yield run
+            begin = run.end
+
+
+def extent(database: sqlite3.Connection, begin: int, end: int) -> Extent:
+    """Returns the extent of the samples from a number to before another."""
+    [found] = database.execute(
+        "SELECT ifnull(min(time), 0), ifnull(max(time), 0), count(*) FROM sample"
+        " WHERE id >= ? AND id < ?",
+        (begin, end),
+    )
+    return Extent(*found)
+
+
+def next_number(database: sqlite3.Connection) -> int:
+    """Returns the number after that of the last sample."""
+    [(last,)] = database.execute("SELECT ifnull(max(id), 0) FROM sample")
+    [(end,)] = database.execute("SELECT ifnull(max(id + samples), 1) FROM run")
+    return max(int(last) + 1, int(end), oldest(database))
+
+
+def oldest(database: sqlite3.Connection) -> int:
+    """Returns the number of the oldest sample that was not dropped."""
+    [(number,)] = database.execute("SELECT oldest FROM file")
+    return int(number)
+
+
+def tags(database: sqlite3.Connection, after: int) -> tuple[dict[str, int], int, bool]:
+    """Returns the tags with higher numbers than `after`, the highest number, and whether some names
+    are damaged: they are left out. Raises `Damaged`."""
+    [(last,)] = database.execute("SELECT tags FROM file")
+    rows = database.execute("SELECT id, key, sum FROM tag WHERE id > ?", (after,)).fetchall()
+    found = {key: number for number, key, total in rows if checksum((number, key)) == total}
+    if not isinstance(last, int):
+        raise Damaged("the number of tags is damaged")
+    return found, max(last, after), len(found) != last - after
+
+
 def is_damage(error: sqlite3.Error) -> bool:
     """True if the file is damaged, or no SQLite database."""
     name = getattr(error, "sqlite_errorname", "")
@@ -242,9 +305,5 @@ def move_aside(path: Path, why: str) -> None:
     """Renames an unusable file, together with the files that SQLite keeps beside it."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     aside = path.with_name(f"{path.name}.aside-{stamp}")
-    path.rename(aside)
-    for tail in ("-wal", "-shm", "-journal"):
-        companion = Path(f"{path}{tail}")
-        if companion.exists():
-            companion.rename(f"{aside}{tail}")
+    move(path, aside)
     log.error("history file moved aside", why=why, moved_to=str(aside))

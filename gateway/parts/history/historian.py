@@ -13,7 +13,6 @@ from gateway.contract.buckets import Bucket, Now
 from gateway.contract.question import Question
 from gateway.contract.timerange import TimeRange, time_range
 from gateway.errors import BadValue, Busy
-from gateway.parts.history.checker import Checker
 from gateway.parts.history.course import Course
 from gateway.parts.history.newest import Newest
 from gateway.parts.history.outcomes import Outcome, Outcomes, Ring
@@ -58,17 +57,14 @@ class Historian:
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
-        self._checker = Checker(self._search)
 
     def start(self) -> None:
         """Starts to write. A file that cannot be opened is tried again: see `document`."""
         self._writer.start()
-        self._checker.start()
 
     def close(self, within: float = 2.0) -> bool:
         """Stores everything in memory; True if that was done in time. Blocks: not on the event
         loop."""
-        self._checker.close()
         return self._writer.close(within)
 
     # -- event loop --
@@ -96,6 +92,7 @@ class Historian:
             "state": self._writer.trouble
             or self._search.damage.sentence(recent.file, recent.sorted_runs)
             or "ok",
+            "aside": [path.name for path in self._writer.aside],
             "recorded": recent.recorded,
             "stored": self._transfer.stored,
             "waiting": recent.waiting,

@@ -46,8 +46,7 @@ class Newest:
             for rows in stored.rows(run, numbers):
                 found += [
                     (time, place, sample)
-                    for number, time, _, value, kind, bad in rows or ()
-                    if number in numbers and period.first <= time <= period.last
+                    for _, _, time, value, kind, bad, _ in rows or ()
                     if has_value(sample := from_row(tag, time, value, kind, bad)) or not only_good
                 ]
                 pause()

@@ -3,22 +3,23 @@
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from heapq import heappop, heappush
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.contract.timerange import TimeRange
-from gateway.errors import Busy
-from gateway.parts.history import sections
-from gateway.parts.history.file import identity
+from gateway.contract.timerange import LATEST, TimeRange
+from gateway.errors import Busy, Damaged
+from gateway.parts.history.file import identity, is_damage, oldest, tags
+from gateway.parts.history.index import Index
 from gateway.parts.history.outcomes import Outcome, Ring
 from gateway.parts.history.recent import Identity, SortedRun
-from gateway.parts.history.sections import FullRow, Section
+from gateway.parts.history.rows import Row, checksum
 from gateway.tags import Sample
 
-_MOST_LISTS = 400  # lists of sections in memory, of 50 kB
+_MOST_INDEXES = 100  # in memory, of 64 to 320 kB
 
 
 class Part(NamedTuple):
@@ -43,7 +44,19 @@ def in_order(parts: Iterable[Part]) -> Iterator[Sample]:
         if heap:
             _, number, sample, rest = heappop(heap)
             yield sample
-            _push(heap, number, rest)
+            until = min(
+                heap[0][0] if heap else LATEST + 1, coming[0][1].first if coming else LATEST + 1
+            )
+            _push(heap, number, (yield from _before(until, rest)))
+
+
+def _before(until: int, rest: Iterator[Sample]) -> Generator[Sample, None, Iterator[Sample]]:
+    """Yields samples of one part as long as no other part has an earlier one. Returns the rest."""
+    for sample in rest:
+        if sample.time >= until:
+            return chain((sample,), rest)
+        yield sample
+    return iter(())
 
 
 def _push(
@@ -69,7 +82,7 @@ class Reader:
         self._generation = 0  # connections of an older one are not used again
         # Of a file: its tags, the highest number, whether names are damaged.
         self._tags: tuple[Identity | None, dict[str, int], int, bool] = (None, {}, 0, False)
-        self._sections: dict[tuple[Identity | None, SortedRun], list[Section]] = {}
+        self._indexes: dict[tuple[Identity | None, SortedRun], Index] = {}
 
     def tags(self, file: Identity | None) -> tuple[Mapping[str, int], bool]:
         """Returns the number of each tag in the file, and whether names are damaged. Raises
@@ -78,55 +91,55 @@ class Reader:
             known_of, known, last, lack = self._tags
         if known_of != file:
             known, last, lack = {}, 0, False
-        with self._connection(file) as database:
-            added, last, more_lack = sections.tags(database, last)
+        with self._connection(file) as database, _translated():
+            added, last, more_lack = tags(database, last)
         known, lack = {**known, **added} if added else known, lack or more_lack
         with self._lock:
             self._tags = file, known, last, lack
         return known, lack
 
-    def sections(self, file: Identity | None, run: SortedRun) -> list[Section]:
-        """Returns the sections of a run. Raises `Damaged`."""
+    def index(self, file: Identity | None, run: SortedRun) -> Index:
+        """Returns the index of a run. Raises `Damaged`."""
         with self._lock:
-            known = self._sections.get((file, run))
+            known = self._indexes.get((file, run))
         if known is None:
-            known = self.listed(file, run)
+            with self._connection(file) as database, _translated():
+                rows = database.execute("SELECT places FROM run WHERE id = ?", (run.number,))
+                known = Index(next(iter(rows), (None,))[0])
             with self._lock:
-                if len(self._sections) >= _MOST_LISTS:
-                    self._sections.clear()
-                self._sections[file, run] = known
+                if len(self._indexes) >= _MOST_INDEXES:
+                    self._indexes.clear()
+                self._indexes[file, run] = known
         return known
 
-    def listed(self, file: Identity | None, run: SortedRun) -> list[Section]:
-        """Returns the sections of a run as they are on disk now. Raises `Damaged`."""
-        with self._connection(file) as database:
-            return sections.read(database, run.number)
-
     def rows(
-        self, file: Identity | None, run: SortedRun, group: Sequence[Section]
-    ) -> list[FullRow] | None:
-        """Returns the rows of neighbouring sections. None if the run was dropped. Raises
-        `Damaged`."""
-        with self._connection(file) as database:
-            # A dropped run leaves its number to another one, with another time.
-            is_same = database.execute(
-                "SELECT 1 FROM run WHERE run = ? AND closed = ?", (run.number, run.closed)
-            )
-            return sections.rows(database, run.number, group) if is_same.fetchall() else None
-
-    def neighbour(
-        self, file: Identity | None, last_run: int, tag: int, time: int, *, later: bool
-    ) -> tuple[int, int] | None:
-        """Returns the run and the time of the last sample of a tag before `time`, or of the first
-        one after it, in the runs up to `last_run`. Raises `Damaged`."""
-        with self._connection(file) as database:
-            return sections.neighbour(database, last_run, tag, time, later=later)
+        self, file: Identity | None, run: SortedRun, numbers: Sequence[int]
+    ) -> tuple[list[Row], bool] | None:
+        """Returns these samples of a run, by their numbers in it, and whether some are lost. None
+        if the run was dropped. Raises `Damaged`."""
+        first = run.number
+        columns = "id, tag, time, value, kind, bad, sum"
+        wanted = f"id BETWEEN {first + numbers[0]:d} AND {first + numbers[-1]:d}"
+        if not isinstance(numbers, range):
+            wanted = f"id IN ({','.join(str(first + n) for n in numbers)})"
+        with self._connection(file) as database, _translated():
+            found = database.execute(
+                f"SELECT {columns} FROM sample WHERE {wanted} ORDER BY id"  # noqa: S608
+            ).fetchall()
+            if oldest(database) > first:
+                return None
+        sound = [row for row in found if checksum(row[:6]) == row[6]]
+        return sound, len(sound) != len(numbers)
 
     def latest_before(self, file: Identity | None, run: SortedRun, time: int) -> int | None:
         """Returns the time of the last sample of any tag in a run before `time`. Raises
         `Damaged`."""
-        with self._connection(file) as database:
-            return sections.latest_before(database, run.number, time)
+        with self._connection(file) as database, _translated():
+            [(found,)] = database.execute(
+                "SELECT max(time) FROM sample WHERE id >= ? AND id < ? AND time < ?",
+                (run.number, run.end, time),
+            )
+            return found if isinstance(found, int) else None
 
     def writes(
         self, ring: Ring, file: Identity | None, last: int, period: TimeRange
@@ -183,3 +196,16 @@ class Reader:
                 self._idle.append(database)
                 return
         database.close()
+
+
+@contextmanager
+def _translated() -> Iterator[None]:
+    """Translates the errors of a damaged file. SQLite quotes damaged text."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        if is_damage(error) or not getattr(error, "sqlite_errorname", ""):
+            raise Damaged(str(error)) from error
+        raise
+    except UnicodeDecodeError as error:
+        raise Damaged(str(error)) from error

@@ -7,7 +7,7 @@ are sorted by tag and time in one transaction. Until then queries are answered f
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,17 +33,19 @@ class Extent(NamedTuple):
     samples: int
 
 
-_NOTHING = Extent(0, 0, 0)
-
-
 class SortedRun(NamedTuple):
-    """A run that is sorted on disk. Times are ns since 1970."""
+    """A run with an index on disk. Times are ns since 1970."""
 
-    number: int
-    first: int  # the earliest and the latest sample in it
+    number: int  # of its first sample
+    first: int  # the earliest and the latest time in it
     last: int
     samples: int
-    closed: int  # when it was sorted
+    closed: int  # when its index was written
+
+    @property
+    def end(self) -> int:
+        """The number after that of its last sample."""
+        return self.number + self.samples
 
     @property
     def extent(self) -> Extent:
@@ -60,7 +62,7 @@ class Run:
     by_tag: dict[str, list[Sample]] = field(default_factory=dict)
     closed: bool = False  # no sample is added any more
     dropped: bool = False  # because too many runs waited
-    number: int = 0  # on disk; 0 while none of it is there
+    number: int = 0  # of its first sample on disk; 0 while none of it is there
     stored: int = 0  # of the samples, on disk
 
     def begins_with(self, extent: Extent) -> bool:
@@ -151,6 +153,12 @@ class Recent:
         return 0
 
     @property
+    def first(self) -> int | None:
+        """The time of the first sample in memory."""
+        with self._lock:
+            return next((run.samples[0].time for run in self._runs if run.samples), None)
+
+    @property
     def waiting(self) -> int:
         """Samples that are not on disk yet."""
         with self._lock:
@@ -196,25 +204,35 @@ class Recent:
             self.sorted_runs = tuple(runs)
 
     def opened(
-        self, file: Identity, sorted_runs: Iterable[SortedRun], unsorted: Mapping[int, Extent]
+        self,
+        file: Identity,
+        runs: Iterable[SortedRun],
+        extent: Callable[[int, int], Extent],
+        end: int,
     ) -> None:
         """Compares the runs in memory with a file that was just opened: the same or another.
 
-        A run leaves memory if the file has the whole of it, sorted. If the file has its beginning,
-        unsorted, the rest is stored next. Every other run is stored from its beginning.
+        `extent`: of so many samples of the file from a number on; `end`: the number after the last.
+        A run leaves memory if the file has the whole of it, with its index. If the file ends with
+        its beginning, the rest is stored next. Every other run is stored from its beginning.
         """
-        sorted_runs = tuple(sorted_runs)
-        extents = {run.number: run.extent for run in sorted_runs}
-        runs = self.runs()
-        whole = {run for run in runs if run.is_whole_in(extents.get(run.number, _NOTHING))}
-        begun = {run for run in runs if run.begins_with(unsorted.get(run.number, _NOTHING))}
+        extents = {run.number: run.extent for run in runs}
+        begun, whole = dict[Run, Extent](), set[Run]()
+        for run in self.runs():
+            there = extent(run.number, len(run.samples)) if run.number else None
+            if there is not None and run.begins_with(there):
+                if run.is_whole_in(there):
+                    begun[run] = there
+                    whole |= {run} if extents.get(run.number) == there else set()
+                elif run.number + there.samples == end:
+                    begun[run] = there
         with self._lock:
-            self.file, self.sorted_runs = file, sorted_runs
+            self.file = file
             self._closed = [run for run in self._closed if run not in whole]
-            for run in runs:
+            for run in self._runs:
                 if run in begun:
-                    self._stored(run, unsorted[run.number].samples)
-                elif run not in whole:
+                    self._stored(run, begun[run].samples)
+                else:
                     self._stored(run, 0)
                     run.number = 0
 

@@ -1,7 +1,8 @@
 """Limits the size of the history file and the age of its samples, on the history thread."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 from gateway.parts.history.file import HistoryFile
 from gateway.parts.history.outcomes import Ring
@@ -10,6 +11,18 @@ from gateway.parts.history.recent import Recent, SortedRun
 _ROOM_OF_OUTCOME = 1024  # bytes in the file; of writes and alarms a tenth each
 # Runs that may expire between two checks. Few, because the wall clock may be wrong for a while.
 _MOST_EXPIRED = 2
+_HOUR = 3600 * 10**9  # ns
+
+
+def age(runs: Sequence[SortedRun], now: int, keep: int) -> int:
+    """Returns the age of the oldest run in ns, by the times that were recorded after it.
+
+    A step counts at most a tenth of `keep`, but up to an hour, in both directions. So a clock that
+    is years ahead makes no sample older than that, and when it is set back, not even that remains.
+    """
+    times = [runs[0].last, *(time for run in runs[1:] for time in (run.first, run.last)), now]
+    longest = max(keep // 10, _HOUR)
+    return sum(max(-longest, min(longest, b - a)) for a, b in pairwise(times))
 
 
 class Retention:
@@ -53,12 +66,12 @@ class Retention:
             self._drop(file, runs[0])
         elif self._may_expire:
             self._may_expire -= 1
-            before = self._wall() - self._keep
-            file.drop_writes(before)
-            old = (run for run in runs if max(run.last, run.closed) < before)
-            if (expired := next(old, None)) is not None:
-                self._drop(file, expired)
+            now_by_wall = self._wall()
+            oldest = runs[0].first if runs else self._recent.first or now_by_wall
+            file.drop_writes(min(now_by_wall - self._keep, oldest))
+            if runs and age(runs, now_by_wall, self._keep) > self._keep:
+                self._drop(file, runs[0])
 
     def _drop(self, file: HistoryFile, dropped: SortedRun) -> None:
         self._recent.set_sorted(run for run in self._recent.sorted_runs if run is not dropped)
-        file.drop(dropped.number)
+        file.drop(dropped)

@@ -2,11 +2,14 @@
 
 The columns are readable with any SQLite tool: `value` is the number or text itself, `kind` marks
 types that SQLite lacks (see `Kind`), `bad` is NULL for a good sample and otherwise the reason.
+Each row has a checksum: a flipped bit makes no other value.
 """
 
+import marshal
 import math
-from enum import IntEnum
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any
+from zlib import crc32
 
 import orjson
 
@@ -16,7 +19,7 @@ from gateway.values import Value
 Stored = int | float | str | bytes | None
 
 
-class Kind(IntEnum):
+class Kind:
     """The type of a value, where the column `kind` is not NULL."""
 
     BOOL = 0  # written as 0 or 1
@@ -26,19 +29,28 @@ class Kind(IntEnum):
     LIST = 4  # an array, written as JSON
 
 
-class Row(NamedTuple):
-    """The columns `time, value, kind, bad`."""
-
-    time: int
-    value: Stored
-    kind: int | None
-    bad: str | None
+# The columns `id, tag, time, value, kind, bad, sum`. The numbers of samples have no gaps.
+Row = tuple[int, int, int, Stored, int | None, str | None, int]
 
 
-def to_row(sample: Sample) -> Row:
+def checksum(row: tuple[Any, ...]) -> int:
+    """marshal's second format never changes, and takes a sixth of the time of `repr`."""
+    return crc32(marshal.dumps(row, 2)) - 2**31  # takes four bytes in the file
+
+
+def to_row(sample: Sample) -> tuple[int, Stored, int | None, str | None]:
+    """Returns the columns `time, value, kind, bad`."""
     value, kind = _stored(sample.value)
-    bad = None if sample.quality is Quality.GOOD else sample.reason or ""
-    return Row(sample.time, value, kind, None if bad is None else str(bad))
+    bad = None
+    if sample.quality is not Quality.GOOD:
+        bad = str(sample.reason or "")
+    return sample.time, value, kind, bad
+
+
+def with_checksum(number: int, tag: int, sample: Sequence[Stored]) -> Row:
+    """Returns the row of a sample, with its checksum."""
+    row = (number, tag, *sample)
+    return (*row, checksum(row))  # type: ignore[return-value]  # the columns of `to_row`
 
 
 def from_row(tag: Tag, time: int, stored: Stored, kind: int | None, bad: str | None) -> Sample:

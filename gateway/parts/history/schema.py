@@ -1,48 +1,34 @@
-"""The tables of the history file, made in a new file and added to an older one."""
+"""The tables of the history file."""
 
 import sqlite3
 from pathlib import Path
 
-from gateway.parts.history import sections
+from gateway.parts.history.outcomes import Ring
 
 APPLICATION = 0x706C6368  # "plch", in the file's header
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
+# Samples in the order of recording: `id` counts them. A run of them gets a row in `run` when it is
+# closed. The table `file` identifies the file, counts the names in `tag`, and has the number of the
+# oldest sample that was not dropped.
 _SCHEMA = """
-CREATE TABLE tag (id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
-CREATE TABLE recent (
-    run INTEGER, n INTEGER, tag INTEGER, time INTEGER, value, kind INTEGER, bad TEXT,
-    PRIMARY KEY (run, n)
-) WITHOUT ROWID;
+CREATE TABLE tag (id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE, sum INTEGER);
 CREATE TABLE sample (
-    run INTEGER, tag INTEGER, time INTEGER, n INTEGER, value, kind INTEGER, bad TEXT,
-    PRIMARY KEY (run, tag, time, n)
-) WITHOUT ROWID;
-CREATE TABLE run (
-    run INTEGER PRIMARY KEY, first INTEGER, last INTEGER, samples INTEGER, closed INTEGER
+    id INTEGER PRIMARY KEY, tag INTEGER, time INTEGER, value, kind INTEGER, bad TEXT, sum INTEGER
 );
-CREATE TABLE written (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
-CREATE INDEX written_time ON written (time);
+CREATE TABLE run (
+    id INTEGER PRIMARY KEY, first INTEGER, last INTEGER, samples INTEGER, closed INTEGER,
+    sum INTEGER, places BLOB
+);
 CREATE VIEW history AS
     SELECT key, datetime(time / 1000000000, 'unixepoch') AS utc, time, value, bad
-    FROM sample JOIN tag ON tag.id = sample.tag
-    UNION ALL
-    SELECT key, datetime(time / 1000000000, 'unixepoch'), time, value, bad
-    FROM recent JOIN tag ON tag.id = recent.tag;
+    FROM sample JOIN tag ON tag.id = sample.tag;
+CREATE TABLE file (mark BLOB, tags INTEGER, oldest INTEGER);
+INSERT INTO file VALUES (randomblob(16), 0, 1);
 """
-
-# Older files lack them.
-_LATER = ("refused", "alarms")
 _OUTCOMES = """
-BEGIN IMMEDIATE;
-CREATE TABLE IF NOT EXISTS {0} (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
-CREATE INDEX IF NOT EXISTS {0}_time ON {0} (time);
-COMMIT;
-"""
-
-_MARK = """
-CREATE TABLE file (mark BLOB);
-INSERT INTO file VALUES (randomblob(16));
+CREATE TABLE {0} (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
+CREATE INDEX {0}_time ON {0} (time);
 """
 
 
@@ -63,15 +49,8 @@ def prepare(database: sqlite3.Connection, path: Path) -> None:
     database.execute("PRAGMA journal_mode = WAL")
     database.execute("PRAGMA cache_size = -4000")
     if not tables:
+        outcomes = "".join(map(_OUTCOMES.format, Ring))
         database.executescript(
             f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
-            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {_MARK} COMMIT;"
+            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {outcomes} COMMIT;"
         )
-    elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
-        database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
-    database.execute(sections.TABLE)
-    sections.adopt_tags(database)
-    for table in _LATER:
-        there = database.execute("SELECT 1 FROM sqlite_schema WHERE name = ?", (table,))
-        if not there.fetchall():
-            database.executescript(_OUTCOMES.format(table))

@@ -1,23 +1,25 @@
 """Finds samples in the file and in memory: of one tag by time, or of many as they were recorded."""
 
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from operator import itemgetter
 
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
+from gateway.contract.timerange import EARLIEST, TimeRange
 from gateway.errors import Busy, Damaged
-from gateway.parts.history import sections
 from gateway.parts.history.damage import Damage
+from gateway.parts.history.index import GROUP, Places
 from gateway.parts.history.reader import Part, Reader, in_order
 from gateway.parts.history.recent import Identity, Recent, SortedRun
-from gateway.parts.history.rows import Stored, from_row
-from gateway.parts.history.sections import FullRow
+from gateway.parts.history.rows import Row, from_row
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 
 _MANY = 2048  # samples in memory between two pauses
-_ALL = range(2**31)  # the numbers of all tags
-_Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its number and tag
+_LOST = 16  # samples that are lost together
+_FEW_TAGS = 100  # for more, a run is read as a whole
+_TIME = itemgetter(2)
 
 
 class Search:
@@ -37,15 +39,16 @@ class Search:
         numbers = stored.numbers({tag.key: tag}, runs)
         begun = False
 
+        def group(run: SortedRun, places: Places) -> list[Sample]:
+            found = stored.read(run, numbers, places.numbers)
+            if found is None and begun:
+                raise Busy("the next samples were dropped meanwhile: ask again")
+            # Dropped before the first sample: as if queried a moment later.
+            return [from_row(tag, *row[2:6]) for row in sorted(found or (), key=_TIME)]
+
         def read(run: SortedRun) -> Iterator[Sample]:
-            for rows in stored.rows(run, numbers):
-                if rows is None:
-                    if begun:
-                        raise Busy("the next samples were dropped meanwhile: ask again")
-                    return  # dropped before the first sample: as if queried a moment later
-                for number, time, _, value, kind, bad in rows:
-                    if number in numbers and period.first <= time <= period.last:
-                        yield from_row(tag, time, value, kind, bad)
+            groups = stored.places(run, numbers)
+            return in_order(Part(each.first, partial(group, run, each)) for each in groups)
 
         parts = [Part(run.first, partial(read, run)) for run in runs]
         parts += [_part_of(run, period) for run in newest]
@@ -61,32 +64,28 @@ class Search:
         """Yields the samples of many tags in the order of recording, each with its place.
 
         `Damaged` is yielded after the rest of a damaged run. Samples without a place in the file
-        come last, without a place: a later search finds them again. The last pair has True, or
-        False before a run that would pass `page` samples: it is not read twice then. Raises `Busy`;
-        calls `pause` at least every few milliseconds of reading.
+        come last, without a place: a later search finds them again. The last pair has True. Raises
+        `Busy`; calls `pause` at least every few milliseconds of reading.
         """
-        tags, page = query.tags, query.page
+        tags = query.tags
         file, sorted_runs, newest = self._recent.content()
         mark = _mark(file)
         (_, begin, first), period = _start(query.after, mark, period)
         stored = StoredRuns(self._reader, self.damage, file, period)
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
-        place, found, of_last_run = (mark, begin, max(first - 1, 0)), 0, 0
+        place, found = (mark, begin, max(first - 1, 0)), False
         for run in runs:
-            if page is not None and 0 < found > page - of_last_run:
-                yield False, place
-                return
             skipped = first if run.number == begin else 0
             if skipped < run.samples and stored.of([run]):
-                placed = stored.placed(run, numbers, pause)
-                if placed is None and found:
-                    raise Busy("the next samples were dropped meanwhile: ask again")
-                rows = [row for row in (placed or [])[skipped:] if row is not None]
-                of_last_run = len(rows)
-                found += of_last_run
-                for row in rows:
-                    yield from_row(*row[1:]), (mark, run.number, row[0])
+                for rows in stored.rows(run, numbers, skipped):
+                    if rows is None and found:
+                        raise Busy("the next samples were dropped meanwhile: ask again")
+                    for number, tag, time, value, kind, bad, _ in rows or ():
+                        found = True
+                        sample = from_row(numbers[tag], time, value, kind, bad)
+                        yield sample, (mark, run.number, number - run.number)
+                    pause()
             place = mark, run.number, max(skipped, run.samples) - 1
             if (lost := stored.lost()) is not None:
                 yield lost, place
@@ -97,20 +96,6 @@ class Search:
             if number:
                 place = mark, number, max(skipped, count) - 1
         yield True, place
-
-    def check(self) -> Iterator[None]:
-        """Reads all sorted runs once, a part for each step, and notes the damage. Raises `Busy`
-        and `sqlite3.Error`."""
-        file, sorted_runs, _ = self._recent.content()
-        for run in sorted_runs:
-            try:
-                listed = self._reader.listed(file, run)
-                for group in sections.groups(listed, _ALL, TimeRange(EARLIEST, LATEST)):
-                    if self._reader.rows(file, run, group) is None:
-                        break  # dropped
-                    yield
-            except Damaged as error:
-                self.damage.found(file, run, str(error))
 
 
 class StoredRuns:
@@ -143,44 +128,45 @@ class StoredRuns:
                 self._note(run, Damaged("the name of a tag is damaged"))
         return {known[key]: tag for key, tag in tags.items() if key in known}
 
-    def rows(self, run: SortedRun, numbers: Collection[int]) -> Iterator[list[FullRow] | None]:
-        """Yields rows of the run in the order of tag and time, at least those of the tags; None if
-        it was dropped. Leaves out damaged sections."""
+    def places(self, run: SortedRun, numbers: Collection[int]) -> list[Places]:
+        """Returns the samples of the run to read, in their order."""
         try:
-            groups = sections.groups(self._reader.sections(self._file, run), numbers, self.period)
-        except Damaged as error:
-            self._note(run, error)
-            return
-        while groups:
-            group = groups.pop(0)
-            try:
-                found = self._reader.rows(self._file, run, group)
-            except Damaged as error:
-                if len(group) > 1:
-                    groups = [[section] for section in group] + groups
-                else:
-                    self._note(run, error)
-                continue
-            yield found
-            if found is None:
-                return
+            return self._reader.index(self._file, run).places(numbers, self.period, _FEW_TAGS)
+        except Damaged:
+            groups = (range(at, at + GROUP) for at in range(0, run.samples, GROUP))
+            return [Places(run.first, group[: run.samples - group[0]]) for group in groups]
 
-    def placed(
-        self, run: SortedRun, numbers: Mapping[int, Tag], pause: Callable[[], None]
-    ) -> list[_Placed | None] | None:
-        """Returns the found rows of a run, each at its number: sorting would take longer. None if
-        it was dropped."""
-        first, last = self.period
-        placed: list[_Placed | None] = [None] * run.samples
-        for rows in self.rows(run, numbers):
-            if rows is None:
-                return None
-            for number, time, n, value, kind, bad in rows:
-                tag = numbers.get(number)
-                if tag is not None and first <= time <= last and n < run.samples:
-                    placed[n] = n, tag, time, value, kind, bad
-            pause()
-        return placed
+    def rows(
+        self, run: SortedRun, numbers: Collection[int], first: int = 0
+    ) -> Iterator[list[Row] | None]:
+        """Yields the rows of the tags in the period, in the order of recording, from the `first`
+        sample of the run on; None if the run was dropped. Leaves out what is damaged."""
+        for _, places in self.places(run, numbers):
+            if wanted := places[bisect_left(places, first) :]:
+                yield (found := self.read(run, numbers, wanted))
+                if found is None:
+                    return
+
+    def read(
+        self, run: SortedRun, numbers: Collection[int], places: Sequence[int]
+    ) -> list[Row] | None:
+        """Returns the rows of the tags in the period, at these places; None if the run was
+        dropped. Leaves out what is damaged."""
+        begin, end = self.period
+        try:
+            found = self._reader.rows(self._file, run, places)
+        except Damaged as error:
+            size = max(1, len(places) // 8)
+            if size < _LOST:
+                self._note(run, error)
+                return []
+            parts = (places[at : at + size] for at in range(0, len(places), size))
+            return [row for part in parts for row in self.read(run, numbers, part) or ()]
+        if found is None:
+            return None
+        if found[1]:
+            self._note(run, Damaged("samples are lost"))
+        return [row for row in found[0] if row[1] in numbers and begin <= row[2] <= end]
 
     def lost(self) -> Damaged | None:
         """Returns an error if parts were left out since the last call."""

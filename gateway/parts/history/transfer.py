@@ -12,7 +12,7 @@ BATCH_SIZE = 8192  # samples in one transaction
 
 
 class Transfer:
-    """Stores runs in the order of arrival, and sorts each in the file once it is closed."""
+    """Stores runs in the order of arrival, and writes the index of each once it is closed."""
 
     def __init__(
         self,
@@ -40,16 +40,13 @@ class Transfer:
 
     def opened(self, file: HistoryFile) -> None:
         """Compares memory with the file, which may be another one than before."""
-        unsorted = file.unsorted_runs()
-        self._recent.opened(file.identity, file.sorted_runs(), unsorted)
+        end = file.next_number()
+        self._recent.opened(file.identity, file.closed_runs(self._wall(), 0), file.extent, end)
         for outcomes in self._outcomes:
             outcomes.opened(file.identity, file.last_write(outcomes.ring))
         self._unsorted = [run for run in self._recent.runs() if run.number]
-        in_memory = {run.number for run in self._unsorted}
-        for number in unsorted:
-            if number not in in_memory:  # left by an earlier process, or dropped from memory
-                file.sort(number, self._wall())
-        self._recent.set_sorted(file.sorted_runs())
+        begin = min((run.number for run in self._unsorted), default=end)
+        self._recent.set_sorted(file.closed_runs(self._wall(), begin))
 
     def run(self, file: HistoryFile) -> None:
         """Stores everything that waits. Raises `sqlite3.Error` and `OSError`."""
@@ -58,16 +55,16 @@ class Transfer:
         self._recent.close_old()
         for run in self._recent.runs():
             self._store_samples(file, run)
-            self._sort_closed(file)
+            self._close_runs(file)
             self._retention.make_room(file)
 
     def _store_samples(self, file: HistoryFile, run: Run) -> None:
         while (count := len(run.samples)) > run.stored:
             if not run.number:
-                run.number = file.new_run()
+                run.number = file.next_number()
                 self._unsorted.append(run)
             end = min(count, run.stored + BATCH_SIZE)
-            file.store(run.number, run.stored, run.samples[run.stored : end])
+            file.store(run.number + run.stored, run.samples[run.stored : end])
             self.stored += end - run.stored
             self._recent.stored(run, end)
 
@@ -83,9 +80,11 @@ class Transfer:
             raise
         outcomes.are_stored(last)
 
-    def _sort_closed(self, file: HistoryFile) -> None:
+    def _close_runs(self, file: HistoryFile) -> None:
         for run in list(self._unsorted):
             if run.dropped or (run.closed and run.stored == len(run.samples)):
-                self._recent.sorted_on_disk(run, file.sort(run.number, self._wall()))
+                end = run.number + run.stored
+                closed = file.close_run(run.number, end, self._wall())
+                self._recent.sorted_on_disk(run, closed)
                 self._unsorted.remove(run)
                 self._retention.run_was_sorted()

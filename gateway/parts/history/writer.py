@@ -11,6 +11,7 @@ from pathlib import Path
 import structlog
 
 from gateway.errors import Damaged
+from gateway.parts.history.aside import asides
 from gateway.parts.history.file import HistoryFile, is_damage, move_aside
 from gateway.parts.history.reader import Reader
 from gateway.parts.history.schema import ForeignFile
@@ -39,6 +40,7 @@ class Writer:
 
     def __init__(self, path: Path, max_size: int, transfer: Transfer, reader: Reader) -> None:
         self.trouble: str | None = "not opened yet"
+        self.aside: list[Path] = []  # files that were moved aside, and that no person knows yet
         self.readable = False  # the file was opened once, so the list of sorted runs is complete
         self._path = path
         self._max_size = max_size
@@ -109,6 +111,7 @@ class Writer:
         now = time.monotonic()
         if now >= self._next_sync:
             self._next_sync = now + SYNC_EVERY
+            self.aside = asides(self._path)
             if not file.is_in_place():
                 file.empty_log()  # otherwise SQLite would write it into the file now at this path
                 raise FileNotFoundError(0, "the file was taken away")

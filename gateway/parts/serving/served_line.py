@@ -20,6 +20,7 @@ from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.parts.serving.conversation import Conversation
 from gateway.stations.served.answering import Answerer, Answering, Heard, Wire
+from gateway.stations.served.echo import Echo
 from gateway.stations.served.registers import Registers, Row, Served
 from gateway.stations.served.registry import answerer
 from gateway.stations.served.station import Presence, Station
@@ -76,6 +77,7 @@ class ServedLine:
         self.record = LineRecord()  # how often it was opened, why it is closed, calls
         self.stale = 0  # requests that later bytes have followed
         self.unsent = 0  # replies that later bytes have followed
+        self._echo = Echo(config.echo)
         self._sink = sink
         self._open_port = open_port
         prepare(config.port)
@@ -204,7 +206,8 @@ class ServedLine:
         made = Wire(
             character=wire.character,
             silence=usual if devices[0].turnaround is None else devices[0].turnaround,
-            echo=self.config.echo,
+            gap=self.config.request_gap,
+            echo=self._echo,
         )
         return answerer(devices[0].driver.protocol, stations, made)
 

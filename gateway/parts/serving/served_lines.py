@@ -48,12 +48,12 @@ class ServedLines:
         self._saving = asyncio.Lock()
         self._rows = {row.tag: row for one in self.stations for row in one.registers.served.rows}
         self._retained: dict[Tag, Value] = {}
-        # By source: the stations that answer with its last good value.
+        # By source or own tag: the stations that answer with its last good value.
         self.remembering: dict[str, list[tuple[Registers, Row]]] = {}
         for station in self.stations:
             for row in station.registers.served.rows:
-                if row.source is not None and row.hold_last:
-                    kept = self.remembering.setdefault(row.source, [])
+                if row.hold_last and not row.accepted:
+                    kept = self.remembering.setdefault(row.source or row.tag.key, [])
                     kept.append((station.registers, row))
 
     @property

@@ -68,8 +68,11 @@ class Verdict(NamedTuple):
 class Row:
     """The state of one transfer. Times in seconds of one clock."""
 
-    def __init__(self, rule: TransferRule, now: float) -> None:
+    def __init__(self, rule: TransferRule, now: float, *, fills: bool = False) -> None:
+        """`fills`: the target is a value that a master reads, and turns bad with its source."""
         self.rule = rule
+        self._fills = fills and rule.substitute is None
+        self._lapsed = False  # the target was turned bad
         self.counts: Counter[End] = Counter()
         self.last: Outcome | None = None  # the end of the last write
         self.carried_at: float | None = None  # when the target acknowledged last
@@ -105,13 +108,22 @@ class Row:
             self.writing = Carry(value, self.rule.stale - source.age)
         return self.writing
 
+    def lapse(self, source: Reading) -> Verdict | None:
+        """Returns the state once, when the target must turn bad: it has an old value."""
+        found = self.verdict(source)
+        if not self._fills or self._lapsed or self.writing or found.state is not State.STALE:
+            return None
+        self._lapsed = True
+        return found
+
     def _note_age(self, source: Reading, now: float) -> Value | None:
         """Returns the value if it may be carried."""
         if source.value is None or not source.age < self.rule.stale:
             return None
         self._good_at = now - source.age
-        if self._substituted:  # the target has the substitute
-            self._substituted = False
+        if self._substituted or self._lapsed:  # the target has no value of the source
+            self._substituted = self._lapsed = False
+            self._held = None
             self._want(now)
         return source.value
 
@@ -176,7 +188,7 @@ class Row:
         if now < self._not_before:
             return self._not_before
         soon = now + min(LOOK_EVERY, self.rule.stale / _LOOKS)
-        looks = self._wanted or self.rule.substitute is not None
+        looks = self._wanted or self.rule.substitute is not None or self._fills
         if self.rule.every is None:
             if self._wanted and now < self._next_change:
                 return min(soon, self._next_change)

@@ -14,7 +14,7 @@ from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
 from gateway.parts.transfers.row import Row, State
 from gateway.plant.conditions import Condition, Conditions, Reading
-from gateway.tags import AlarmRule, Level, Quality, Sample, Tag, WriteResult
+from gateway.tags import AlarmRule, Level, Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.timestamps import rfc3339
 from gateway.tags.transfer import TransferRule
 from gateway.values import Value
@@ -43,6 +43,14 @@ class Plant(Protocol):
     def age(self, tag: Tag) -> float:
         """Returns the seconds since the last read; infinite if there was none."""
 
+    def holds(self, tag: Tag) -> bool:
+        """Returns True for a value that clients write and a master reads."""
+
+    def samples(self, samples: Sequence[Sample]) -> None: ...
+
+    def wall(self) -> int:
+        """Returns ns since 1970."""
+
 
 class Write(Protocol):
     """Writes as a client does, for `by`. After `within` seconds nothing is sent any more.
@@ -59,9 +67,9 @@ class _Running:
 
     __slots__ = ("carried", "row", "rule", "source", "target", "task", "wake")
 
-    def __init__(self, rule: TransferRule, now: float) -> None:
+    def __init__(self, rule: TransferRule, now: float, *, fills: bool) -> None:
         self.rule = rule
-        self.row = Row(rule, now)
+        self.row = Row(rule, now, fills=fills)
         self.source: Tag | None = None
         self.target: Tag | None = None
         self.carried: WriteResult | None = None  # the last one
@@ -125,7 +133,7 @@ class Transfers:
 
     def _begin(self, rule: TransferRule, source: Tag, target: Tag) -> None:
         now = asyncio.get_running_loop().time()
-        one = _Running(rule, now)
+        one = _Running(rule, now, fills=self._plant.holds(target))
         self._add(one, source, target)
         self._plant.age(source)  # from now on it is known
         self.publish([self._plant.sample(source)])
@@ -193,10 +201,23 @@ class Transfers:
                 outcome = await self._carry(one, carry)
                 one.row.ended(outcome, loop.time())
                 continue
+            self._lapse(one, one.source)
             with suppress(TimeoutError):
                 at = one.row.wake(loop.time())
                 async with asyncio.timeout_at(None if at == math.inf else at):
                     await one.wake.wait()
+
+    def _lapse(self, one: _Running, source: Tag) -> None:
+        """Turns a value that a master reads bad with its source; not that of another writer."""
+        reading = self._reading(source)
+        old = one.row.lapse(reading)
+        if old is None or one.target is None:
+            return
+        held = self._plant.sample(one.target)
+        if one.carried is None or held.quality is Quality.BAD or held.time == one.carried.time:
+            reason = reading.reason or Reason.OVERDUE
+            at = self._plant.wall()
+            self._plant.samples([bad(one.target, reason, at, f"{one.name}: {old.why}")])
 
     def _reading(self, source: Tag) -> rows.Reading:
         sample = self._plant.sample(source)

@@ -4,10 +4,10 @@ Liyan Computer Link manual (Lylink-edoc0307), section numbers below are its own.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal, TypeVar
 
-from gateway.errors import BadValue, ConfigError
+from gateway.errors import BadValue, ConfigError, Refused, Unclear
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.computer_link.access import Access, possible, read_access, write_access
 from gateway.protocols.computer_link.codec import (
@@ -30,6 +30,7 @@ from gateway.protocols.computer_link.replies import (
     describe_stray,
     model_name,
 )
+from gateway.protocols.computer_link.resync import ResyncKind
 from gateway.protocols.computer_link.scattered import (
     data_characters,
     decode_all,
@@ -39,6 +40,7 @@ from gateway.protocols.computer_link.scattered import (
 )
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import EVERY_REQUEST, Address, Area, Cost, Span, Talk, Timing, Traits
+from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.listening import Ear, Learn
 
 LinkTalk = Talk[Frame]
@@ -47,6 +49,7 @@ T = TypeVar("T")
 _TRAITS = Traits(baudrate=9600, format="7E1")
 _COUNT, _CODE = 2, 2  # characters of a count, of an error code
 _ACK = "ack"
+_WIDER = 4  # addresses around the only one, for reads of another length
 _SWITCH = {"1": "1", "on": "1", "true": "1", "0": "0", "off": "0", "false": "0"}
 
 
@@ -67,6 +70,7 @@ class ComputerLink:
     send_area_c: bool = False
     monitor: bool = False
     monitor_word_command: Literal["MN", "MW"] = "MN"
+    _kind: ResyncKind = field(init=False, repr=False, compare=False)
 
     scan_hints: ClassVar = ScanHints(
         formats=("7E1", "8N1", "8E1", "7O1"),
@@ -80,6 +84,7 @@ class ComputerLink:
     no_reply_causes: ClassVar = NO_REPLY_CAUSES
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "_kind", ResyncKind())
         if self.profile not in PROFILES:
             raise ConfigError(f"profile {self.profile!r} is not one of {', '.join(PROFILES)}")
         if not 0 <= self.station <= self._limits.last_station:
@@ -244,9 +249,51 @@ class ComputerLink:
         probe_token: int,
         spans: Sequence[Span] = (),
     ) -> int:
-        """Sends a loopback. No data reply has its letter Z; the rest is the `probe_token`."""
-        await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
-        return EVERY_REQUEST
+        """Sends a loopback, or a read inside the `spans`, as the station answers.
+
+        No data reply has the letter Z of the loopback; the rest is the `probe_token`. A read has
+        another length than the `outstanding` one. A NAK names no request: it may be the late reply
+        to that read, so one more read of another length follows it.
+        """
+        reads = self._harmless(outstanding, spans)
+        loopback = not reads or self._kind.is_loopback(probe_token)
+        try:
+            if loopback:
+                await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
+                told = EVERY_REQUEST
+            else:
+                told = await self._resync_by_read(talk, outstanding, probe_token, reads)
+        except Unclear:
+            self._kind.unanswered(loopback=loopback)
+            raise
+        self._kind.answered(loopback=loopback)
+        return told
+
+    def _harmless(self, outstanding: Span | None, spans: Sequence[Span]) -> HarmlessReads:
+        """Returns short reads inside the spans; if all have one length, around them too."""
+        inside = HarmlessReads(spans, outstanding, self.reply_shape)
+        if inside:
+            return inside
+        wider = []
+        for area, start, size in spans:
+            last = self.areas[area].last
+            wider.append(Span(area, max(min(start, last - _WIDER + 1), 0), max(size, _WIDER)))
+        return HarmlessReads(wider, outstanding, self.reply_shape)
+
+    async def _resync_by_read(
+        self, talk: LinkTalk, outstanding: Span | None, token: int, reads: HarmlessReads
+    ) -> int:
+        first, second = reads.pick(token), reads.pick(token + 1)
+        try:
+            await self.read(talk, first)
+        except Refused:
+            if self.reply_shape(first) == self.reply_shape(second):
+                raise
+            await self.read(talk, second)
+            first = second
+        if self.monitor:  # the length of the reply to a list is not known here
+            return 0
+        return told_from(first, token, outstanding, reads.pick, self.reply_shape)
 
     # Listening to another master
 
@@ -278,8 +325,11 @@ class ComputerLink:
     def resync_shape(
         self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
     ) -> Hashable:
-        """None: the letter Z and the token are no data of any other reply."""
-        return None
+        """None for a loopback: the letter Z and the token are no data of any other reply."""
+        reads = self._harmless(outstanding, spans)
+        if not reads or self._kind.is_loopback(probe_token):
+            return None
+        return self.reply_shape(reads.pick(probe_token))
 
     def is_reply(self, frame: Frame) -> bool:
         """False for an enquiry, and for on-demand data."""

@@ -1,15 +1,17 @@
 """The contract of an answering machine: bytes of the wire in, at most one reply out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from gateway.protocols.driver import AnyDriver
+from gateway.stations.served.echo import Echo
 from gateway.stations.served.registers import Registers
 from gateway.stations.store import Written
 
 # Fewer bytes behind a request are noise of the wire; more are the beginning of the next request.
 NOISE = 2
+_CHARACTERS = 4  # a master that is slow pauses for so many within a request
 
 
 class Done(NamedTuple):
@@ -59,7 +61,16 @@ class Wire:
 
     character: float  # the duration of one character
     silence: float = 0.0  # before a reply
-    echo: bool | None = None  # the port receives its own bytes; None: not known
+    gap: float | None = None  # the longest pause within a request; None: `usual`
+    echo: Echo = field(default_factory=Echo)
+
+    def usual(self, adapter: float) -> float:
+        """Returns the longest pause within a request. `adapter`: what an adapter adds to it."""
+        return adapter + _CHARACTERS * self.character
+
+    def pause(self, adapter: float) -> float:
+        """Returns the pause after which a request begins again: as the file says, or `usual`."""
+        return self.usual(adapter) if self.gap is None else self.gap
 
 
 Stations = Mapping[int, Answering]

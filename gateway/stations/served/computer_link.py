@@ -18,7 +18,7 @@ from gateway.stations.served.answering import (
     Wire,
 )
 
-_TIME_OUT = 0.1  # seconds between two characters of a request, at most (D8129)
+_ADAPTER = 0.1  # seconds between two characters of a request that an adapter adds (D8129)
 # The reply to PC, as the Mitsubishi models of these profiles reply.
 _MODELS: dict[Profile, str] = {"liyan": "9E", "ex1s": "F2", "ex1n": "9E", "ex2n": "9D", "fx": "9D"}
 
@@ -38,7 +38,7 @@ class _Line:
         self._reader = RequestReader(self._frame_format, self._sum_check)
 
     def hear(self, data: bytes, now: float) -> Heard:
-        self._reader.expire(now, _TIME_OUT)
+        self._reader.expire(now, self._wire.pause(_ADAPTER))
         texts = self._reader.feed(data, now)
         known = [addressed(text) for text in texts]
         ours = [number in self._stations or number == ALL_STATIONS for number in known]

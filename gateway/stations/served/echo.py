@@ -1,43 +1,98 @@
-"""The echo of a two-wire adapter, on the side of a station: its own reply comes back."""
+"""The echo of a two-wire adapter, on the side of a station: its own reply comes back.
 
-from gateway.stations.served.answering import Wire
+Some replies of Modbus are equal to their requests, so an echo looks like the master that writes
+the same value again. Replies of another form prove an echo when they return, and prove that there
+is none when they do not. Where only equal frames are known, the station replies "busy" once: the
+master repeats its request, and an echo returns the "busy".
+"""
 
-_LATENCY = 0.03  # seconds of an adapter that collects bytes
+from dataclasses import dataclass, field
+from enum import Enum
+
+_LATEST = 1.0  # seconds after its reply within which an echo arrives
+_EARLY = 0.5  # times the shortest known delay: a frame before that is no echo
+_MISSES = 3  # replies without an echo, in a row, until the adapter does not echo any more
+_AGAIN, _MORE = 8, 8  # equal frames in a row until the station asks again; then so many times more
 
 
+class Sort(Enum):
+    """The origin of a frame that the station received."""
+
+    REQUEST = "request"
+    ECHO = "echo"
+    DOUBTFUL = "doubtful"  # either; the reply "busy" shows it
+
+
+@dataclass(slots=True)
+class _Reply:
+    """A reply whose echo may still arrive."""
+
+    frame: bytes
+    at: float
+    proves: bool  # its form is that of no request
+
+
+@dataclass(slots=True)
 class Echo:
-    """Recognizes the reply of this station where it would be taken for a request.
+    """The belief about the echo of one wire. `told`: the setting in the file; None: learn it."""
 
-    Some replies of Modbus are equal to their requests. Without `echo` in the file, the first frame
-    after a reply shows if the adapter echoes. Until then a frame that is equal to the reply, and
-    arrives while the reply is on the wire, counts as its echo: no master is that fast.
-    """
+    told: bool | None = None
+    _known: bool | None = None
+    _delay: float = 0.0  # the shortest one
+    _replies: list[_Reply] = field(default_factory=list)
+    _misses: int = 0
+    _equal: int = 0  # frames in a row that were equal to the reply before
+    _limit: int = _AGAIN
 
-    def __init__(self, wire: Wire) -> None:
-        self._character = wire.character
-        self._known = wire.echo
-        self._reply = b""  # the reply whose echo may still arrive
-        self._by = 0.0
+    def pending(self, now: float) -> list[bytes]:
+        """Returns the echoes that may arrive next."""
+        self._forget(now)
+        return [reply.frame for reply in self._replies]
 
-    @property
-    def pending(self) -> bytes:
-        """The echo that may arrive next; empty: none."""
-        return self._reply
+    def sent(self, reply: bytes, now: float, *, proves: bool) -> None:
+        """Notes a reply. `proves`: its form is that of no request."""
+        if self.told is not False:
+            self._replies.append(_Reply(reply, now, proves))
 
-    def sent(self, reply: bytes, now: float) -> bytes:
-        """Notes a reply. Returns `pending`."""
-        if self._known is not False:
-            self._reply = reply
-            self._by = now + 2 * len(reply) * self._character + _LATENCY
-        return self._reply
+    def judge(self, frame: bytes, now: float) -> Sort:
+        """Returns the origin of a frame."""
+        self._forget(now)
+        place = next((i for i, one in enumerate(self._replies) if one.frame == frame), None)
+        if place is None or self.told is False:
+            self._equal = 0
+            return Sort.REQUEST
+        one = self._replies[place]
+        if one.proves:
+            self._known, self._delay = True, min(self._delay or 9.0, now - one.at)
+        elif self.told is None and not self._known:
+            return self._doubt(place)
+        elif now - one.at < _EARLY * self._delay:
+            return Sort.REQUEST
+        self._misses = self._equal = 0
+        del self._replies[: place + 1]
+        return Sort.ECHO
 
-    def is_echo(self, frame: bytes, now: float) -> bool:
-        """Returns True for the frame that is the echo of the last reply."""
-        reply, self._reply = self._reply, b""
-        if not reply:
-            return False
-        if frame == reply and (self._known or now <= self._by):
-            return True
-        if self._known is None and frame != reply:
-            self._known = False
-        return False
+    def _doubt(self, place: int) -> Sort:
+        """Judges a frame that is equal to a reply, where nothing has shown an echo.
+
+        Echoes keep their order: while an older one may still arrive, the frame is a request.
+        """
+        self._equal += 1
+        if self._known is False:
+            if self._equal < self._limit:
+                return Sort.REQUEST
+            self._known, self._limit = None, self._limit * _MORE
+        elif place:
+            return Sort.REQUEST
+        self._replies.clear()
+        return Sort.DOUBTFUL
+
+    def _forget(self, now: float) -> None:
+        """Drops the replies whose echo did not arrive."""
+        while self._replies and now - self._replies[0].at > _LATEST:
+            one = self._replies.pop(0)
+            self._misses += 1
+            if self._known:
+                self._known = None if self._misses >= _MISSES else True
+            elif one.proves:
+                self._known = False

@@ -21,9 +21,10 @@ from gateway.stations.served.answering import (
     Stations,
     Wire,
 )
-from gateway.stations.served.echo import Echo
+from gateway.stations.served.echo import Sort
 
 _WRITES = (*WRITE_SINGLE, *WRITE_MANY)
+_BUSY = 6  # exception: the master repeats its request later
 _NO_PATH = 0x0A  # exception: a gateway without this unit behind it
 _ANY_UNIT = (0, 255)  # the device at the address itself (messaging guide V1.0b, 4.4.2.2)
 
@@ -79,14 +80,16 @@ class _Serial:
         self._stations = {number: _Station(one) for number, one in stations.items()}
         self._wire = wire
         self._reader = reader
-        self._echo = Echo(wire)
 
     def hear(self, data: bytes, now: float) -> Heard:
-        reader, echo = self._reader, self._echo
-        frames = [
-            frame for frame in reader.feed(data, now) if not echo.is_echo(reader.encode(frame), now)
-        ]
-        reader.echo = echo.pending
+        reader, echo = self._reader, self._wire.echo
+        reader.echoes = echo.pending(now)
+        frames, sort = list[Frame](), Sort.REQUEST
+        for frame in reader.feed(data, now):
+            judged = echo.judge(reader.encode(frame), now)
+            if judged is not Sort.ECHO:
+                frames.append(frame)
+                sort = judged
         ours = [frame for frame in frames if frame.station in self._stations or frame.station == 0]
         if not ours:
             return SILENCE
@@ -96,10 +99,14 @@ class _Serial:
         stale = len(ours) - 1
         if request.station == 0:
             return Heard(done=self._broadcast(request.pdu), stale=stale)
-        answer, done = self._stations[request.station].answer(request.pdu)
+        if sort is Sort.DOUBTFUL:
+            answer, effects = bytes((request.pdu[0] | EXCEPTION, _BUSY)), list[Done]()
+        else:
+            answer, effect = self._stations[request.station].answer(request.pdu)
+            effects = [effect]
         reply = reader.encode(Frame(request.station, answer))
-        reader.echo = echo.sent(reply, now)
-        return Heard(reply, self._wire.silence, (done,), stale)
+        echo.sent(reply, now + self._wire.silence, proves=answer != request.pdu)
+        return Heard(reply, self._wire.silence, tuple(effects), stale)
 
     def _broadcast(self, pdu: bytes) -> tuple[Done, ...]:
         """Every station carries it out where it may be written; none replies."""
@@ -114,7 +121,7 @@ class AsciiReader:
     def __init__(self) -> None:
         self._codec = AsciiCodec()
         self.following = 0  # bytes behind the last frame
-        self.echo = b""  # not needed: every reply has the form of a frame
+        self.echoes: list[bytes] = []  # not needed: every reply has the form of a frame
 
     def feed(self, data: bytes, _now: float) -> list[Frame]:
         """Returns the sound frames that `data` completes, requests and replies of any station."""
@@ -128,7 +135,7 @@ class AsciiReader:
 
 _SHORTEST, _LONGEST = 4, 256  # bytes of a frame
 # Seconds. An adapter passes bytes on in pieces, with pauses that were not on the wire.
-_PATIENCE = 0.05
+_ADAPTER = 0.05
 
 
 class RtuReader:
@@ -142,21 +149,25 @@ class RtuReader:
     def __init__(self, stations: Stations, wire: Wire) -> None:
         self._ours = frozenset(stations) | {0}
         self._gap = max(0.00175, 3.5 * wire.character)
+        self._pause, self._usual = wire.pause(_ADAPTER), wire.usual(_ADAPTER)
         self._heard = bytearray()
         self._starts: list[int] = []  # places in `_heard` after a silence
+        self._anew = 0  # the last one after a pause longer than usual
         self._skipped = NOISE  # bytes that were skipped at this place
         self._lost = False
         self._at = float("-inf")  # the time of the last bytes
         self.following = 0  # bytes behind the last frame
-        self.echo = b""  # the echo of a reply that may arrive next
+        self.echoes: list[bytes] = []  # of replies, which may arrive next
 
     def feed(self, data: bytes, now: float) -> list[Frame]:
         """Returns the sound frames that `data` completes, of any station."""
         silence, self._at = now - self._at, now
-        if silence > _PATIENCE or (self._lost and silence > self._gap):
+        if silence > self._pause or (self._lost and silence > self._gap):
             self._begin()
         elif silence > self._gap and self._heard:
             self._starts.append(len(self._heard))
+            if silence > self._usual:
+                self._anew = len(self._heard)
         if self._lost:
             return []
         if not self._heard and silence > self._gap:
@@ -173,6 +184,7 @@ class RtuReader:
         """Begins again after a silence."""
         self._heard.clear()
         self._starts.clear()
+        self._anew = 0
         self._lost, self._skipped = False, 0
 
     @staticmethod
@@ -192,8 +204,10 @@ class RtuReader:
                     self._skipped = NOISE  # a frame may follow at once, noise only after a silence
                     return frame
             if len(heard) < max(sizes):
-                return None
-            if self._starts:
+                if not self._is_again():
+                    return None
+                self._cut(self._anew)
+            elif self._starts:
                 self._cut(self._starts[0])
                 self._skipped = 0
             elif self._skipped < NOISE:
@@ -202,11 +216,23 @@ class RtuReader:
             else:
                 self.following = len(heard)
                 heard.clear()
+                self._anew = 0
                 self._lost = True
         return None
 
+    def _is_again(self) -> bool:
+        """Returns True when the master gave up half a request and sent it again."""
+        rest = self._heard[self._anew :]
+        return bool(
+            self._anew
+            and len(rest) >= _SHORTEST
+            and rest[0] in self._ours
+            and _is_sound(rest, _request_size(rest))
+        )
+
     def _cut(self, size: int) -> None:
         del self._heard[:size]
+        self._anew = max(self._anew - size, 0)
         self._starts = [start - size for start in self._starts if start > size]
 
     def _sizes(self) -> list[int]:
@@ -221,8 +247,9 @@ class RtuReader:
         sizes = [_request_size(heard)]
         if heard[0] not in self._ours:
             sizes.append(_reply_size(heard))
-        elif self.echo and (self.echo.startswith(heard) or heard.startswith(self.echo)):
-            sizes.append(len(self.echo))
+        sizes += [
+            len(echo) for echo in self.echoes if echo.startswith(heard) or heard.startswith(echo)
+        ]
         if 0 in sizes:
             waits = heard[0] in self._ours and not self._starts
             sizes += [len(heard), _LONGEST] if waits else [len(heard)]

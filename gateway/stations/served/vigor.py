@@ -13,7 +13,7 @@ from gateway.stations.served.answering import (
 )
 from gateway.stations.vigor import addressed, answer
 
-_GAP = 0.1  # seconds between two characters of a request, at most
+_ADAPTER = 0.1  # seconds between two characters of a request that an adapter adds
 
 
 class _Line:
@@ -26,7 +26,7 @@ class _Line:
         self._at = float("-inf")  # the time of the last bytes
 
     def hear(self, data: bytes, now: float) -> Heard:
-        if now - self._at > _GAP:
+        if now - self._at > self._wire.pause(_ADAPTER):
             self._reader = RequestReader()  # half a request is no beginning of another one
         self._at = now
         requests = self._reader.feed(data)

@@ -1,0 +1,217 @@
+"""The `check` command: validates the file and prints the plan of each line."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Annotated
+
+import typer
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from gateway.cli.config.modem_plan import modem_plan, modem_warnings
+from gateway.cli.config.served_plan import served_plan
+from gateway.cli.progress import progress
+from gateway.cli.terminal import FAILED, ConfigPath, err, out
+from gateway.config import Config, expanded_text, load, state_folder
+from gateway.engine.forecast import LineForecast, why_not_learned
+from gateway.northbound.northbound import check as zenoh_warnings
+from gateway.parts.history.place import trouble
+from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
+from gateway.parts.web import exposure
+from gateway.planning.planner import describe
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.tags.tag import CounterRule
+
+
+def check(
+    config: ConfigPath,
+    blocks: Annotated[
+        bool | None,
+        typer.Option("--blocks/--no-blocks", help="Every request (default: if at most 100)"),
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="End with 1 if a line is overloaded.")
+    ] = False,
+    expand: Annotated[
+        bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
+    ] = False,
+) -> None:
+    """Validate the file and print the plan of each line. Sends nothing."""
+    if expand:
+        load(config)
+        print(expanded_text(config), end="")
+        return
+    with progress(err) as report:
+        loaded = load(config, report)
+        warnings = zenoh_warnings(loaded) + exposure.check(loaded)
+        lines = forecasts(loaded, report)
+    few = sum(len(line.blocks) for line in lines) <= 100
+    out.print(plan(lines, every_block=few if blocks is None else blocks))
+    for part in _without_polls(loaded):
+        out.print(part)
+    by_name = {line.name: line for line in lines}
+    modems = [(line, by_name.get(line.name)) for line in loaded.lines if line.modem is not None]
+    for line, forecast in modems:
+        out.print(Text(modem_plan(line, forecast)))
+        warnings += [] if forecast is None else modem_warnings(line, forecast)
+    if loaded.transfers:
+        out.print(_transfers(transfer_forecasts(loaded, lines)))
+    for note in _notes(loaded):
+        err.print(f"note: {note}")
+    for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
+        err.print(f"warning: {warning}")
+    if unwritable := list(_unwritable(loaded)):
+        for sentence in unwritable:
+            err.print(f"error: {sentence}")
+        sys.exit(FAILED)
+    print(f"{config}: good, {size(loaded)}")
+    if strict and any(line.overloaded for line in lines):
+        sys.exit(FAILED)
+
+
+def _without_polls(config: Config) -> Iterator[RenderableType]:
+    """Yields the served lines, and which tags of the listen-only lines can be learned."""
+    yield from (served_plan(line) for line in config.lines if line.serve)
+    for line in config.lines:
+        if not line.listen_only:
+            continue
+        tags = [(device.driver, tag) for device in line.devices for tag in device.wire_tags]
+        reasons = {tag.key: why for driver, tag in tags if (why := why_not_learned(driver, tag))}
+        yield (
+            f"line {line.name} only listens: {len(tags) - len(reasons)} of "
+            f"{_counted(len(tags), 'tag')} can be learned, when another master reads them"
+        )
+        yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
+
+
+def _notes(config: Config) -> Iterator[str]:
+    tags = [tag for one in config.devices if one.served is None for tag in one.tags]
+    for tag in tags:
+        if tag.write is not None and tag.part is not None:
+            part = "one bit" if tag.address.bit is not None else "one byte"
+            yield (
+                f"writing {tag.key} ({tag.text}) reads the word, changes {part} and writes "
+                "the word back; changes by the PLC in between are lost"
+            )
+    for tag in tags:
+        if tag.origin.kept is None and (limit := tag.exact_below) is not None:
+            yield (
+                f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
+                " either way two values of the device can look equal, and a write can be one"
+                " step off"
+            )
+    totals = [tag.key for tag in tags if isinstance(tag.origin.kept, CounterRule)]
+    if totals and config.state_file is None:
+        yield (
+            f"{', '.join(totals[:5])}: a total begins again at each start of the gateway: "
+            "write `state: state.json` below `gateway:`"
+        )
+    for sheet in config.sheets:
+        yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
+
+
+def _unwritable(config: Config) -> Iterator[str]:
+    """Yields a sentence for each file that the gateway could not write."""
+    kept = config.history
+    below = "set" if state_folder() else "not set"
+    for setting, file in (
+        ("history.path", None if kept is None else kept.path),
+        ("gateway.state", config.state_file),
+        ("alarms.path", config.alarms.path),
+    ):
+        if file is not None and (why := trouble(file)) is not None:
+            yield (
+                f"{setting}: {file} cannot be written: {why}. Check as the user of the service, "
+                f"with its $STATE_DIRECTORY ({below} here)"
+            )
+
+
+def size(config: Config) -> str:
+    """Returns the size of a configuration: `22 tags on 3 lines`."""
+    tags = sum(len(device.tags) for device in config.devices)
+    return f"{_counted(tags, 'tag')} on {_counted(len(config.lines), 'line')}"
+
+
+def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
+    """Renders the plan of all lines."""
+    parts: list[RenderableType] = []
+    for line in lines:
+        parts.append(_line(line))
+        if every_block and (line.blocks or line.unsolicited):
+            parts.append(_blocks(line))
+        parts.append(Text())
+    return Group(*parts)
+
+
+def _line(line: LineForecast) -> Text:
+    writes = (
+        f"\n  worst write latency {seconds(line.worst_write)}, "
+        f"{seconds(line.worst_write_silent)} when a station has just gone offline"
+    )
+    returned = f"\n  a silent station that returns is seen within {seconds(line.seen_within)}"
+    if line.seen_at_worst > line.seen_within:
+        returned += f", {seconds(line.seen_at_worst)} while polls take all of the wire"
+    if not line.blocks:
+        text = f"line {line.name}: no requests {_speed(line.wire)}"
+        return Text(text + writes if line.worst_write else text)
+    return Text(
+        f"line {line.name}: {_counted(len(line.blocks), 'request')}, {line.requests:.2f} a second, "
+        f"{line.characters:.0f} characters a second {_speed(line.wire)}\n"
+        f"  load {line.load:.1%} of the wire; one round of all requests takes {seconds(line.cycle)}"
+        + writes
+        + returned
+    )
+
+
+def _blocks(line: LineForecast) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("  device", "request", "tags", "every", "characters", "takes", "worst age"):
+        table.add_column(column)
+    for row in line.blocks:
+        block = row.block
+        table.add_row(
+            f"  {row.device.name}",
+            describe(block),
+            str(len(block.tags)),
+            seconds(block.every),
+            f"{block.cost.request} + {block.cost.reply}",
+            seconds(row.seconds),
+            seconds(row.worst_age),
+        )
+    for device, tags in line.unsolicited:
+        table.add_row(f"  {device.name}", "unsolicited", str(tags))
+    return table
+
+
+def seconds(time: float) -> str:
+    """Formats a duration: `12.3 ms`, `1.43 s`."""
+    return f"{time * 1000:.1f} ms" if time < 1 else f"{time:.2f} s"
+
+
+def _transfers(rows: Sequence[TransferForecast]) -> RenderableType:
+    """Renders the transfers: their share of the line that they write on is in its load."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("  row", "from", "to", "when", "takes", "line", "load", "worst age"):
+        table.add_column(column)
+    for row in rows:
+        source, target = row.rule.text
+        table.add_row(
+            f"  {row.rule.number}",
+            Text(source),
+            Text(target),
+            row.rule.when,
+            seconds(row.writes.seconds),
+            Text(row.line),
+            f"{row.load:.1%}",
+            "" if row.worst_age is None else seconds(row.worst_age),
+        )
+    return Group(Text("transfers, if each value changes with each read:"), table, Text())
+
+
+def _speed(wire: WireTiming) -> str:
+    return "over the network" if wire.baudrate == NETWORK_BAUD else f"at {wire.baudrate} baud"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,0 +1,195 @@
+"""The `history` commands: recorded samples as CSV or Parquet, and a history that was damaged."""
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gateway.cli.client.arguments import matches, wanted_keys
+from gateway.cli.history.history_files import Column, new_file, write_csv, writer_of
+from gateway.cli.terminal import ConfigPath, TagNames, err
+from gateway.config import Config, load
+from gateway.contract.buckets import Now
+from gateway.contract.question import Question, question
+from gateway.contract.timerange import TimeRange, time_range
+from gateway.errors import Damaged, GatewayError
+from gateway.parts.history.aside import asides, rename
+from gateway.parts.history.course import Course
+from gateway.parts.history.offline import offline
+from gateway.parts.history.salvage import salvage as salvaged
+from gateway.parts.history.search import Search
+from gateway.tags import Quality, Reason, Sample, Tag
+from gateway.tags.recorded import RecordedQuery
+from gateway.tags.sample import has_value
+
+cli = typer.Typer(help="Recorded samples.", no_args_is_help=True)
+
+_wall = time.time_ns
+_SAMPLES = [
+    Column("time", "time"),
+    Column("tag", "word"),
+    Column("value", "value"),
+    Column("quality", "word"),
+    Column("reason", "word"),
+]
+
+
+@cli.callback()
+def commands() -> None:
+    """Recorded samples."""
+
+
+@cli.command()
+def export(
+    config: ConfigPath,
+    tags: TagNames = None,
+    period: Annotated[
+        str, typer.Option("--time", help="A range as in a query of Zenoh")
+    ] = "[now(-1d)..]",
+    bucket: Annotated[
+        str | None, typer.Option(help="Rows are buckets of this length, such as 1min")
+    ] = None,
+    agg: Annotated[str | None, typer.Option(help="min,max,mean,last or some of them")] = None,
+    quality: Annotated[str, typer.Option(help="good: leave out what is not good")] = "any",
+    output: Annotated[
+        Path | None, typer.Option(help="A new .csv or .parquet file (default: print CSV)")
+    ] = None,
+    history: Annotated[
+        Path | None, typer.Option(help="Another history file, such as a copy of `backup`")
+    ] = None,
+    decimal_comma: Annotated[
+        bool, typer.Option("--decimal-comma", help="0,1 and ; as German or French Excel reads it")
+    ] = False,
+) -> None:
+    """Export samples of the history file. The gateway may run, or not."""
+    loaded = load(config)
+    given = {"time": period, "bucket": bucket, "agg": agg, "quality": quality}
+    asked = question({name: text for name, text in given.items() if text is not None}, "time")
+    now = _wall()
+    asked_period = time_range(asked.time_range, now)
+    found = _tags(loaded, tags)
+    columns = _SAMPLES if asked.bucket is None else _bucket_columns(asked)
+    path = history or _path(loaded, config)
+    with offline(path) as (search, course):
+        lost: list[Damaged] = []
+        if asked.bucket is None:
+            rows = _samples(search, found, asked, asked_period, now, lost)
+        else:
+            rows = _buckets(course, found, asked, asked_period, now, lost)
+        if output is None:
+            write_csv(sys.stdout, columns, rows, comma=decimal_comma)
+        else:
+            write = writer_of(output, columns, comma=decimal_comma)
+            with new_file(output) as unfinished:
+                count = write(unfinished, rows)
+            err.print(f"{output}: {count} rows of {path}")
+        if lost:
+            raise GatewayError(f"{path}: {lost[0]}; all others were exported")
+
+
+@cli.command()
+def salvage(config: ConfigPath) -> None:
+    """Bring back the samples of a history that was moved aside. Stop the gateway first."""
+    path = _path(load(config), config).resolve()
+    back = salvaged(path)
+    err.print(f"{path}: {back} samples are back; the old files are beside it")
+
+
+@cli.command()
+def known(config: ConfigPath) -> None:
+    """End the fault of a history that was moved aside. The gateway may run, or not."""
+    path = _path(load(config), config).resolve()
+    found = asides(path)
+    if not found:
+        raise GatewayError(f"no file beside {path} was moved aside")
+    for one in found:
+        try:
+            err.print(f"{one} is {rename(one, 'known').name} now")
+        except OSError as error:
+            raise GatewayError(f"{one} was not renamed: {error.strerror}") from None
+
+
+def _samples(
+    search: Search,
+    tags: Mapping[str, Tag],
+    asked: Question,
+    period: TimeRange,
+    now: int,
+    lost: list[Damaged],
+) -> Iterator[tuple[Any, ...]]:
+    """Yields rows in the order of recording."""
+    query = RecordedQuery(tags, asked.time_range, None, now)
+    for sample, _ in search.as_recorded(query, period, _nothing):
+        if isinstance(sample, Damaged):
+            lost.append(sample)
+        elif not isinstance(sample, bool) and (has_value(sample) or not asked.only_good):
+            yield _row(sample)
+
+
+def _row(sample: Sample) -> tuple[Any, ...]:
+    if has_value(sample):
+        return sample.time, sample.tag.key, sample.value, "good", None
+    reason = Reason.NOT_A_NUMBER if sample.quality is Quality.GOOD else sample.reason
+    return sample.time, sample.tag.key, None, "bad", None if reason is None else reason.value
+
+
+def _buckets(
+    course: Course,
+    tags: Mapping[str, Tag],
+    asked: Question,
+    period: TimeRange,
+    now: int,
+    lost: list[Damaged],
+) -> Iterator[tuple[Any, ...]]:
+    """Yields rows tag by tag. The last value of a tag is valid as long as a gateway recorded."""
+    width = asked.bucket or 0
+    for tag in tags.values():
+        try:
+            for bucket in course.buckets(tag, period, width, Now(now, is_valid=False), _nothing):
+                if bucket.quality != "good" and asked.only_good:
+                    continue
+                values = bucket._asdict()
+                yield (
+                    bucket.time,
+                    tag.key,
+                    bucket.quality,
+                    *(values[name] for name in asked.aggregates),
+                    bucket.good,
+                    bucket.bad,
+                    bucket.known / 1e9,
+                    None if bucket.quality == "good" else bucket.reason,
+                )
+        except Damaged as error:
+            lost.append(error)
+
+
+def _bucket_columns(asked: Question) -> list[Column]:
+    return [
+        Column("time", "time"),
+        Column("tag", "word"),
+        Column("quality", "word"),
+        *(Column(name, "value") for name in asked.aggregates),
+        Column("good", "count"),
+        Column("bad", "count"),
+        Column("known", "number"),
+        Column("reason", "word"),
+    ]
+
+
+def _tags(config: Config, names: list[str] | None) -> dict[str, Tag]:
+    wanted = wanted_keys(config, names)
+    tags = (tag for device in config.devices for tag in device.tags)
+    return {tag.key: tag for tag in tags if matches(tag.key, wanted)}
+
+
+def _path(config: Config, file: Path) -> Path:
+    if config.history is None:
+        raise GatewayError(f"{file} has no `history:` section")
+    return config.history.path
+
+
+def _nothing() -> None:
+    """A command has nobody to give way to."""

@@ -1,0 +1,1 @@
+"""Commands that use a line without a gateway: scan, peek, record, replay."""

@@ -1,0 +1,133 @@
+"""The `replay` command: what a recording tells, and if this version still reads it the same."""
+
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.cli.line.capture import Capture
+from gateway.cli.line.logs import LogFormat, LogLevel, set_up
+from gateway.cli.line.peek import SettingOption
+from gateway.cli.line.recorded_line import Log, line_of_file, line_of_protocols
+from gateway.cli.line.replay_serve import serve
+from gateway.cli.terminal import FAILED, printable
+from gateway.config import LineConfig
+from gateway.errors import ConfigError, GatewayError
+from gateway.line.exchanges import shown
+from gateway.parts.recording.recorded import timed
+from gateway.parts.recording.replay import Difference, Learned, Replay
+from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
+
+
+def replay(
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG...", help="Files of a recording, or its folder.")
+    ],
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="The YAML file of the line.")
+    ] = None,
+    line: Annotated[
+        str | None, typer.Option("--line", help="The line; left out: that of the recording.")
+    ] = None,
+    protocol: Annotated[
+        list[str] | None,
+        typer.Option(help="Without --config: vigor, modbus-rtu ...; left out: as noted."),
+    ] = None,
+    setting: SettingOption = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare with the values in the recording.")
+    ] = False,
+    pcapng: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the bytes for Wireshark instead.")
+    ] = None,
+    as_plant: Annotated[
+        bool, typer.Option("--serve", help="Serve it as simulated PLCs, on a pty.")
+    ] = False,
+    tcp: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve it on TCP instead.")
+    ] = None,
+) -> None:
+    """Decode a recording: the values of each reply, with its time. Sends nothing.
+
+    Without --config each address has its own name, as the PLC has it.
+    """
+    log = Log(logs, line)
+    if config is None:
+        of = line_of_protocols(log, protocol or [], setting or [])
+    elif protocol or setting:
+        raise ConfigError("with --config, its settings are used: leave out --protocol and --set")
+    else:
+        of = line_of_file(config, log)
+    if as_plant or tcp is not None:
+        set_up(LogFormat.TEXT, LogLevel.INFO)
+        serve(of, list(timed(log.entries())), tcp)
+    elif pcapng is not None:
+        with Capture(pcapng, of) as capture:
+            for entry in log.entries():
+                if isinstance(entry, LoggedPiece):
+                    capture.add(entry.at or 0.0, entry.way, entry.data)
+    elif config is None:
+        _decode(of, log, check=check)
+    else:
+        _compare(of, log.entries(), check=check)
+
+
+def _decode(line: LineConfig, log: Log, *, check: bool) -> None:
+    if check:
+        raise ConfigError("--check needs --config: the names of the values are in the file")
+    events = (one for one in Replay(line).run(timed(log.entries())) if isinstance(one, Learned))
+    learned = False
+    for event in events:
+        learned = True
+        _print(event)
+    if not learned:
+        raise GatewayError(
+            "nothing was learned: no reply belongs to its request for certain. Is there another "
+            "protocol on the line too? Name each with --protocol"
+        )
+
+
+def _compare(line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, check: bool) -> None:
+    replayed = Replay(line)
+    for event in replayed.run(log):
+        if isinstance(event, Difference):
+            at, tag, value = event.logged
+            now = json.dumps(event.learned, ensure_ascii=False)
+            print(
+                f"{_clock(at)} {tag}: {json.dumps(value, ensure_ascii=False)} recorded, {now} now"
+            )
+        elif not check:
+            _print(event)
+    checked = replayed.checked
+    print(
+        f"{checked.equal} values as recorded, {checked.different} others, "
+        f"{checked.missing} not learned",
+        file=sys.stdout if check else sys.stderr,
+    )
+    if checked.different:
+        sys.exit(FAILED)
+    if check and not checked.equal:
+        raise GatewayError("nothing was compared: the recording has no values of this line")
+
+
+def _print(event: Learned) -> None:
+    for text in _lines(event):
+        print(printable(text))
+
+
+def _lines(event: Learned) -> Iterator[str]:
+    """Returns the good values of a reply, and each reason of bad ones."""
+    good = [sample for sample in event.samples if sample.value is not None]
+    if good:
+        yield f"{_clock(event.at)} {good[0].tag.device}: {shown(good)}"
+    for sample in event.samples:
+        if sample.value is None:
+            yield f"{_clock(event.at)} {sample.tag.key}: bad, {sample.reason}: {sample.detail}"
+
+
+def _clock(at: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]

@@ -1,0 +1,130 @@
+"""The `import` command: tags of a sheet into the configuration, all or none."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.cli.sheets.import_transfers import BOM, backup_of, import_transfers, read_file, replace
+from gateway.cli.terminal import err
+from gateway.config import Config, ConfigErrors, SheetUse, load
+from gateway.config.messages import one_of
+from gateway.config.sheets import devices_in, link_table, read_grid
+from gateway.config.sheets.tags import preview
+from gateway.config.yaml.insert import entry, with_tags
+from gateway.errors import ConfigError
+from gateway.tags import Tag
+
+SheetPath = Annotated[
+    Path, typer.Argument(metavar="SHEET", help="CSV, tab-separated text or .xlsx; with titles.")
+]
+
+
+def import_(
+    sheet: SheetPath,
+    into: Annotated[
+        Path | None, typer.Option(help="The YAML file that gets the tags; left out: print them")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="The device in that file (default: its only one)")
+    ] = None,
+    transfers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE",
+            help="The rows of a PLC's communication table become transfers; DEVICE is that PLC.",
+        ),
+    ] = None,
+) -> None:
+    """Import the tags of a sheet into the configuration. With a mistake nothing is written."""
+    if transfers is not None:
+        import_transfers(sheet, into, transfers)
+        return
+    grid = read_grid(read_file(sheet))
+    named = [] if link_table.is_table(grid) else devices_in(grid)
+    if into is None:
+        tags, notes = preview(sheet, grid, device or (named[0] if len(named) == 1 else ""))
+        print_notes(sheet, notes)
+        print("tags:", *(f"  {entry(name, raw)}" for name, raw in tags.items()), sep="\n")
+        err.print("addresses and limits are not checked yet: name the file with --into")
+        return
+    for line in add_tags(sheet, into, [device] if device else named):
+        print(line)
+
+
+def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True) -> list[str]:
+    """Adds the tags of a sheet to the file. Returns sentences about it.
+
+    `backup`: the file as it was stays beside it.
+
+    Raises `ConfigErrors` with every mistake; then the file is as before.
+    """
+    devices = devices or _devices_of_table(sheet, into) or _only_device(into)
+    before = read_file(into)
+    try:
+        wanted = load(into, imports={device: sheet.absolute() for device in devices})
+    except ConfigErrors as error:
+        ending = "one mistake" if error.count == 1 else f"{error.count} mistakes"
+        last = f"{ending}: nothing was written"
+        raise ConfigErrors([*error.messages, last], error.count) from None
+    uses = [use for use in wanted.sheets if use.file == sheet.absolute()]
+    missing = set(devices) - {use.device for use in uses}
+    text = before.removeprefix(BOM).decode()
+    for use in uses:
+        comment = f"{len(use.raw)} tags from {sheet.name}"
+        text = with_tags(str(into), text, use.device, use.raw, comment)
+    if missing:
+        with_tags(str(into), text, missing.pop(), {}, "")  # raises: names the devices of the file
+    after = (BOM if before.startswith(BOM) else b"") + text.encode()
+    own = into.resolve()  # the file itself, not a link to it
+
+    def check(new: Path) -> None:
+        if _meaning(load(new)) != _meaning(wanted):
+            raise ConfigError(
+                f"the tags cannot be inserted into {own.name} as it is written: "
+                "write `tags_from: <sheet>` into the device instead"
+            )
+
+    replace(own, before, after, check, backup_of(own) if backup else None)
+    for use in uses:
+        print_notes(sheet, use.notes)
+    said = [_said(sheet, into, use) for use in uses]
+    return [*said, f"the file before is {backup_of(into).name}"] if backup else said
+
+
+def _said(sheet: Path, into: Path, use: SheetUse) -> str:
+    return f"{into.name}: {len(use.raw)} tags of {sheet.name} added to {use.device}"
+
+
+def print_notes(sheet: Path, notes: tuple[str, ...] | list[str]) -> None:
+    for note in notes:
+        err.print(f"note: {sheet.name}: {note}")
+
+
+def _devices_of_table(sheet: Path, into: Path) -> list[str]:
+    """Returns the devices whose stations a communication table has; none for another sheet."""
+    stations = link_table.stations_in(read_grid(read_file(sheet)))
+    devices = load(into).devices if stations else ()
+    known = {device.driver.station: device.name for device in devices}
+    if missing := [station for station in stations if station not in known]:
+        raise ConfigError(
+            f"{into.name} has no device with station {one_of(map(str, missing))}, which "
+            f"{sheet.name} names: add it, or name one device with --device"
+        )
+    return [known[station] for station in stations]
+
+
+def _only_device(into: Path) -> list[str]:
+    names = [device.name for device in load(into).devices]
+    if len(names) != 1:
+        raise ConfigError(f"name the device with --device: {into.name} has {', '.join(names)}")
+    return names
+
+
+def _meaning(config: Config) -> dict[str, tuple[object, ...]]:
+    return {tag.key: _settings(tag) for device in config.devices for tag in device.tags}
+
+
+def _settings(tag: Tag) -> tuple[object, ...]:
+    return tuple(getattr(tag, one.name) for one in fields(tag) if one.init)

@@ -1,0 +1,158 @@
+"""The sections of the file as pydantic sees them: name, type and meaning of every setting.
+
+An editor shows the descriptions. Mistakes that need more than one setting (an address that the
+device does not have, two stations with one number) are found by `gateway.config.build`.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+)
+
+from gateway.config.settings import parsers
+from gateway.config.settings.modem_settings import ModemSection
+from gateway.config.settings.session_model import GatewaySection, Section, ZenohSection
+from gateway.config.settings.setting_types import (
+    FORMAT_SCHEMA,
+    Baudrate,
+    Duration,
+    FilePath,
+    HostName,
+    Interval,
+    Port,
+    Text,
+    WebAddress,
+)
+
+
+class WritersSection(Section):
+    """The clients that may write, by their secrets."""
+
+    file: FilePath
+    """One line `name:secret` for each client; see docs/security.md."""
+
+
+class HistorySection(Section):
+    """Samples kept on disk, for tags with `history: true`."""
+
+    path: FilePath = Path("history.db")
+    """The SQLite file, relative to $STATE_DIRECTORY, else to this file's folder."""
+    keep: Interval = 7 * 86400.0
+    """Older samples are deleted."""
+    max_size: Annotated[
+        int,
+        PlainValidator(parsers.size),
+        WithJsonSchema({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"}),
+    ] = 10**9
+    """The oldest samples are deleted when the file grows beyond this size."""
+
+
+class AlarmsSection(Section):
+    """The alarms of the gateway."""
+
+    path: FilePath | None = None
+    """Keeps alarms across restarts; left out: alarms.json in $STATE_DIRECTORY, or beside this file
+    if a tag has an alarm."""
+    devices: bool = True
+    """A device that does not reply is an alarm."""
+    lines: bool = True
+    """A line that is down is an alarm."""
+    transfers: bool = True
+    """A transfer that does not work is an alarm."""
+
+
+class WebSection(Section):
+    """The status page and /metrics."""
+
+    listen: WebAddress = ("127.0.0.1", 8080)
+    """The address of the page."""
+    tokens_file: FilePath | None = None
+    """One line `name:token` for each client; without it nothing can be written."""
+    names: list[HostName] = []
+    """Names of this machine in a browser's address, besides `localhost` and its host name."""
+
+
+class DeviceSection(Section):
+    """Settings of a device that do not depend on its protocol."""
+
+    reply_timeout: Interval | None = None
+    """Time-out from request to reply, without the time of the characters on the wire."""
+    turnaround: Duration | None = None
+    """Usual time from request to reply; left out: measured."""
+    silence: Duration | None = None
+    """Pause on the line before each request; left out: learned, where no standard asks for it."""
+    retries: Annotated[int, Field(ge=0, le=10)] | None = None
+    """Repetitions of a failed read; writes are not repeated."""
+    verify_reads: Annotated[int, Field(ge=1, le=3)] = 1
+    """The number of equal reads in a row before a value counts."""
+    late_guard: Duration | None = None
+    """The longest wait for a late reply after a time-out, before the next request."""
+    blocks: Annotated[
+        bool | Literal["only"],
+        PlainValidator(parsers.blocks),
+        WithJsonSchema({"enum": [True, False, "only"]}),
+    ] = False
+    """One put per scan with all changed tags, at <device>/@block: true adds it, only replaces."""
+    control: bool = False
+    """Permission for commands to the device, such as run and stop."""
+    enabled: bool = True
+    """false: the device stays in the file and gets no requests."""
+    accept: list[Text] = []
+    """On a served line: the addresses that the master may write, such as D100..D119."""
+    stale_after: Interval | None = None
+    """On a served line: what the master wrote turns bad when it sends no request for so long."""
+    defaults: dict[str, Any] = {}
+    tags: dict[str, Any] = {}
+    """The values of the device, by name."""
+    tags_from: FilePath | None = None
+    """A sheet with more tags of the device, CSV or .xlsx: docs/import.md."""
+
+
+class LineSection(Section):
+    """One line and the devices on it."""
+
+    port: Port
+    """A serial port, tcp://host:port, rfc2217://host:port, modem:<one of these>, or simulator."""
+    baudrate: Baudrate = None
+    """Speed of the line, also behind a device server; left out: the default of the protocol."""
+    format: Annotated[
+        str | None, PlainValidator(parsers.serial_format), WithJsonSchema(FORMAT_SCHEMA)
+    ] = None
+    """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
+    echo: bool | None = None
+    """true: the port receives its own requests, as with some two-wire RS-485 converters."""
+    serve: bool = False
+    """true: the devices are stations of this gateway, and a master on the line asks them."""
+    request_gap: Duration | None = None
+    """With serve: the longest pause within a request; left out: by the speed, 2 s with a modem."""
+    listen_only: bool = False
+    """true: learns the values from another master's traffic, and sends nothing, ever."""
+    modem: ModemSection | None = None
+    """The modem of a port `modem:…`, and its calls: docs/modem.md."""
+    defaults: dict[str, Any] = {}
+    devices: dict[str, Any]
+    """The devices on this line, by name."""
+
+
+class FileSection(Section):
+    """A gateway between PLCs and Zenoh."""
+
+    gateway: GatewaySection = GatewaySection()
+    zenoh: ZenohSection = ZenohSection()
+    writers: WritersSection | None = None
+    history: HistorySection | None = None
+    web: WebSection | None = None
+    alarms: AlarmsSection = AlarmsSection()
+    templates: dict[str, Any] = {}
+    """Devices with parameters, which devices `use`: docs/templates.md."""
+    templates_from: str | list[str] = []
+    """Files with more templates."""
+    defaults: dict[str, Any] = {}
+    lines: dict[str, Any]
+    """The lines, by name."""
+    transfers: list[Any] = []
+    """Values that the gateway reads from one PLC and writes to another: docs/transfers.md."""

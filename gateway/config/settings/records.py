@@ -1,0 +1,130 @@
+"""The checked and complete configuration: plain data for the rest of the gateway."""
+
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, replace
+from ipaddress import ip_address
+from pathlib import Path
+
+from gateway.config.settings.zenoh_records import ZenohConfig
+from gateway.config.sheets.tags import SheetUse
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.planning.wire_timing import WireTiming
+from gateway.tags import Tag
+from gateway.tags.transfer import TransferRule
+from gateway.transport.modem_events import ModemSettings
+from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryConfig:
+    """The store of samples. `keep` in seconds, `max_size` in bytes."""
+
+    path: Path
+    keep: float
+    max_size: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmsConfig:
+    """The file that keeps alarms, and the alarms that need no setting."""
+
+    path: Path | None = None  # None: a restart forgets them
+    devices: bool = True
+    lines: bool = True
+    transfers: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WebConfig:
+    """The address of the status page, and who may use it."""
+
+    host: str
+    port: int
+    tokens_file: Path | None = None  # None: nothing can be written
+    names: tuple[str, ...] = ()  # of this machine, in the address of a browser
+
+    @property
+    def is_local(self) -> bool:
+        """True if other machines cannot reach the address."""
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineConfig:
+    """One line and the devices on it."""
+
+    name: str
+    port: PortAddress
+    serial: SerialSettings
+    wire: WireTiming
+    echo: bool | None  # the port receives its own requests; None: unknown
+    serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
+    request_gap: float | None = None  # seconds within a request of that master; None: by the speed
+    modem: ModemSettings | None = None  # with a modem at the port
+    listen_only: bool = False  # another master owns the wire: nothing is ever sent
+    devices: tuple[DeviceSettings, ...]
+
+    @property
+    def simulated(self) -> bool:
+        return isinstance(self.port, SimulatorAddress)
+
+    @property
+    def tags(self) -> tuple[Tag, ...]:
+        return tuple(tag for device in self.devices for tag in device.tags)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Config:
+    """One whole file. `history` and `web` are None where the file has not the section."""
+
+    name: str
+    state_file: Path | None = None  # learned properties of the devices, across restarts
+    standby: str | None = None  # the group of an active and a standby gateway
+    standby_alone: float | None = None  # seconds without a link until it becomes active
+    secret_file: Path | None = None  # None: claims and tokens are not signed
+    writers_file: Path | None = None  # None: every client of Zenoh may write
+    folder: Path | None = None  # of the files that the gateway writes
+    writers_state: Path | None = None  # with `writers_file`: what a restart must not accept again
+    zenoh: ZenohConfig
+    history: HistoryConfig | None
+    web: WebConfig | None
+    alarms: AlarmsConfig = AlarmsConfig()
+    lines: tuple[LineConfig, ...]
+    transfers: tuple[TransferRule, ...] = ()
+    watch: bool = False  # a changed file is reloaded by itself
+    sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
+
+    @property
+    def devices(self) -> tuple[DeviceSettings, ...]:
+        return tuple(device for line in self.lines for device in line.devices)
+
+    @property
+    def dialling(self) -> Mapping[str, float]:
+        """The devices behind a modem: seconds that a request may wait for a telephone call."""
+        return {
+            device.name: line.modem.dial_timeout
+            for line in self.lines
+            if line.modem is not None
+            for device in line.devices
+        }
+
+    @property
+    def held_file(self) -> Path | None:
+        """The file of the values with `retain: true`."""
+        return None if self.state_file is None else self.state_file.with_suffix(".held.json")
+
+    def without(self, devices: Container[str]) -> "Config":
+        """Returns the file without some devices, and without lines that have no others."""
+        lines = [
+            replace(line, devices=tuple(d for d in line.devices if d.name not in devices))
+            for line in self.lines
+        ]
+        left = (
+            line
+            for line, before in zip(lines, self.lines, strict=True)
+            if line.devices or not before.devices
+        )
+        return replace(self, lines=tuple(left))

@@ -1,0 +1,110 @@
+"""Types of single settings for pydantic and for editors: durations, names, files, endpoints."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, WrapValidator
+
+from gateway.config.settings import parsers
+from gateway.transport.port import PortAddress
+from gateway.values import BYTES, Kind, Order
+
+DURATION_SCHEMA: dict[str, Any] = {
+    "type": "string",
+    "pattern": r"^[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$",
+    "examples": ["500ms", "2s", "15min", "1h", "7d"],
+}
+INTERVAL_SCHEMA = DURATION_SCHEMA | {
+    "pattern": r"^(?=[0-9.]*[1-9])[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$"
+}
+# To an editor `40101` as an address and `true` as a unit are a number and a boolean.
+TEXT_SCHEMA: dict[str, Any] = {"type": ["string", "number", "boolean"]}
+# Letters and digits of any script: the pattern excludes the other characters of ASCII.
+_NAME = r"[^\x00-,/:-@\[-\^`{-\x7f\s]+"
+NAME_PATTERN, TAG_NAME_PATTERN = f"^{_NAME}$", f"^{_NAME}(/{_NAME})*$"
+_CHUNK = r"[^/@*$?#][^/*$?#]*"
+FORMAT_SCHEMA = {
+    "anyOf": [
+        {"type": "string", "enum": [f"{d}{p}{s}" for d in "78" for p in "NEO" for s in "12"]},
+        {"type": "number", "enum": [70, 700, 80, 800]},
+    ]
+}
+_KINDS = [kind.value for kind in Kind if kind is not Kind.STRING]
+_ARRAYS = "|".join(kind for kind in _KINDS if kind not in BYTES)
+TYPE_SCHEMA = {
+    "anyOf": [
+        {"type": "string", "enum": _KINDS},
+        {"type": "string", "pattern": r"^string\[0*([1-9][0-9]?|1[0-9]{2}|2[0-4][0-9]|250)\]$"},
+        {"type": "string", "pattern": rf"^({_ARRAYS})\[0*([1-9][0-9]{{0,2}}|1[0-9]{{3}}|2000)\]$"},
+    ]
+}
+DEADBAND_SCHEMA = {
+    "anyOf": [
+        {"type": "number", "minimum": 0},
+        {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?%$"},
+    ]
+}
+SCALE_SCHEMA = {"type": "number", "not": {"const": 0}}
+_ENDPOINT_SCHEMA = {
+    "type": "string",
+    "pattern": r"^[a-z][a-z0-9_-]*/[^\s/]\S*$",
+    "examples": ["tcp/127.0.0.1:7447"],
+}
+_ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
+_HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+)"
+_PORT_SCHEMA = {
+    "type": "string",
+    # A network port, or a path: no other scheme, and no `host:port` without a scheme.
+    "pattern": rf"^((tcp|rfc2217)://{_HOST}:[0-9]{{1,5}}"
+    r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
+    "examples": [
+        "/dev/ttyUSB0",
+        "COM3",
+        "tcp://10.0.0.7:4001",
+        "rfc2217://host:port",
+        "modem:/dev/ttyS0",
+        "simulator",
+    ],
+}
+
+Duration = Annotated[float, PlainValidator(parsers.duration), WithJsonSchema(DURATION_SCHEMA)]
+Interval = Annotated[float, PlainValidator(parsers.interval), WithJsonSchema(INTERVAL_SCHEMA)]
+Text = Annotated[str, Field(strict=True), WithJsonSchema(TEXT_SCHEMA)]
+Name = Annotated[
+    str, PlainValidator(parsers.name), WithJsonSchema(TEXT_SCHEMA | {"pattern": NAME_PATTERN})
+]
+Group = Annotated[
+    str, PlainValidator(parsers.name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
+]
+Prefix = Annotated[
+    str,
+    PlainValidator(parsers.prefix),
+    WithJsonSchema(TEXT_SCHEMA | {"pattern": f"^{_CHUNK}(/{_CHUNK})*$"}),
+]
+Port = Annotated[PortAddress, PlainValidator(parsers.port), WithJsonSchema(_PORT_SCHEMA)]
+Baudrate = Annotated[
+    int | None,
+    PlainValidator(parsers.baudrate),
+    WithJsonSchema({"type": "integer", "enum": list(parsers.BAUDRATES)}),
+]
+WebAddress = Annotated[
+    tuple[str, int],
+    PlainValidator(parsers.web_address),
+    WithJsonSchema({"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
+]
+HostName = Annotated[
+    str,
+    PlainValidator(parsers.host_name),
+    WithJsonSchema({"type": "string", "pattern": r"^[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?$"}),
+]
+FilePath = Annotated[Path, PlainValidator(parsers.path), WithJsonSchema({"type": "string"})]
+OrderName = Annotated[Order, PlainValidator(parsers.order), WithJsonSchema(_ORDER_SCHEMA)]
+Endpoint = Annotated[str, PlainValidator(parsers.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
+Endpoints = Annotated[list[Endpoint], AfterValidator(parsers.once)]
+Distance = Annotated[
+    float,
+    WrapValidator(parsers.every_digit),
+    AfterValidator(parsers.not_negative),
+    WithJsonSchema({"type": "number", "minimum": 0}),
+]
+Finite = Annotated[float, Field(allow_inf_nan=False), WrapValidator(parsers.every_digit)]

@@ -1,0 +1,20 @@
+"""Sheets of tags: rows of a spreadsheet as settings of tags, and tags as rows.
+
+A sheet is a CSV or text file of any spreadsheet or PLC program, or an .xlsx file. Columns are found
+by their titles. Nothing here knows addresses or limits: the configuration checks those.
+"""
+
+from gateway.config.sheets import link_table
+from gateway.config.sheets.grid import Grid, neutral, read_grid
+from gateway.config.sheets.sheet import Sheet, SheetMistake, devices_in, read_sheet
+
+__all__ = [
+    "Grid",
+    "Sheet",
+    "SheetMistake",
+    "devices_in",
+    "link_table",
+    "neutral",
+    "read_grid",
+    "read_sheet",
+]

@@ -1,0 +1,110 @@
+"""Builds the tags of devices. Tags that are written alike are built once and copied."""
+
+from dataclasses import dataclass, field
+
+from gateway.config.messages import Mistakes, Path
+from gateway.config.settings import parsers
+from gateway.config.settings.validate import section
+from gateway.config.tags.features.bits import with_bits
+from gateway.config.tags.field_tags import field_tag
+from gateway.config.tags.section import ComputedSection, TagDefaults, TagSection, TagSource, inherit
+from gateway.config.tags.word_tags import build_tag
+from gateway.errors import ConfigError
+from gateway.protocols.driver import Addressing
+from gateway.protocols.models import Model, model_of
+from gateway.protocols.typed_fields import TypedFields
+from gateway.tags import Tag
+
+# By the text of the settings: numbers and booleans that are equal in Python are not alike.
+_Alike = dict[str, Tag]
+
+
+@dataclass(slots=True)
+class DeviceTags:
+    """Builds the tags of all devices of a file, and notes every mistake."""
+
+    mistakes: Mistakes
+    recorded: Path | None = None  # the first tag with `history: true`
+    computed: list[TagSource] = field(default_factory=list)
+    _names: dict[str, str] = field(default_factory=dict)  # correct ones, as typed
+    _built: dict[tuple[Model, str], _Alike] = field(default_factory=dict)
+
+    def build(
+        self,
+        device: str,
+        raw_tags: object,
+        path: Path,
+        defaults: TagDefaults,
+        driver: Addressing | None,
+    ) -> tuple[Tag, ...]:
+        """Returns the tags of a device, without those that have mistakes."""
+        alike: _Alike = {}
+        if driver is not None:
+            alike = self._built.setdefault((model_of(driver), repr(defaults)), alike)
+        tags: list[Tag] = []
+        seen: set[str] = set()
+        rows = with_bits(dict(mapping(raw_tags)), path, driver, self.mistakes)
+        for raw_name, raw, place in rows:
+            name = self._names.get(raw_name) or self._name(raw_name, place)
+            if name in seen:
+                self.mistakes.add(place, f"{name} is there twice, typed in two ways")
+            seen.add(name)
+            if isinstance(raw, dict) and "computed" in raw:
+                self._note_computed(device, name, raw, place, defaults)
+                continue
+            text = repr(raw)
+            known = alike.get(text)
+            if known is not None:
+                tag: Tag | None = known.copy(device, name)
+            else:
+                before = len(self.mistakes)
+                tag = self._tag(device, name, raw, place, defaults, driver)
+                if tag is not None and len(self.mistakes) == before:
+                    alike[text] = tag
+            if tag is not None:
+                if tag.publishing.history and self.recorded is None:
+                    self.recorded = place
+                tags.append(tag)
+        return tuple(tags)
+
+    def _tag(
+        self,
+        device: str,
+        name: str,
+        raw: object,
+        place: Path,
+        defaults: TagDefaults,
+        driver: Addressing | None,
+    ) -> Tag | None:
+        own = section(TagSection, raw, place, self.mistakes, "a tag")
+        if own is None or driver is None:
+            return None
+        unknown_type = isinstance(raw, dict) and "type" in raw and own.type is None
+        source = TagSource(device, name, own, defaults, place, type_unknown=unknown_type)
+        if isinstance(driver, TypedFields):
+            return field_tag(source, driver, driver, self.mistakes)
+        return build_tag(source, driver, self.mistakes)
+
+    def _note_computed(
+        self, device: str, name: str, raw: object, place: Path, defaults: TagDefaults
+    ) -> None:
+        own = section(ComputedSection, raw, place, self.mistakes, "a computed tag")
+        if own is None:
+            return
+        self.computed.append(TagSource(device, name, own, defaults, place))
+        if inherit(defaults, own).history and self.recorded is None:
+            self.recorded = place
+
+    def _name(self, text: str, path: Path) -> str:
+        try:
+            name = parsers.tag_name(text)
+        except ConfigError as error:
+            self.mistakes.add(path, str(error))
+            return text
+        self._names[text] = name
+        return name
+
+
+def mapping(raw: object) -> list[tuple[str, object]]:
+    """Returns the entries of a mapping, and none of anything else."""
+    return list(raw.items()) if isinstance(raw, dict) else []

@@ -1,0 +1,191 @@
+"""Makes tags: checks that the device has the address and that all settings fit."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from gateway.config.messages import Mistakes
+from gateway.config.tags.arrays import most_that_fits
+from gateway.config.tags.features.feature import Facts, Problem
+from gateway.config.tags.features.layout import default_type, layout_of, type_misfit
+from gateway.config.tags.features.writing import check_bounds, needs_write, rule_of
+from gateway.config.tags.registry import FEATURES
+from gateway.config.tags.section import TagSource, inherit
+from gateway.errors import ConfigError
+from gateway.protocols.driver import Address, Addressing, Span, Unit
+from gateway.tags import Tag, WriteRule
+from gateway.values import ValueType
+
+_SIZES = {Unit.BIT: "bits", Unit.WORD: "words", Unit.DWORD: "values of 32 bits"}
+
+
+def build_tag(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Tag | None:
+    """Returns the tag, or None after its mistakes were noted."""
+    before = len(mistakes)
+    address = address_of(source, driver, mistakes)
+    if address is None:
+        return None
+    area = driver.areas.get(address.area)
+    if area is None:  # a broadcast has no areas that are only readable
+        problem = f"{source.own.address} is read-only, and station {driver.station} cannot be read"
+        mistakes.add((*source.path, "address"), problem)
+        return None
+    if source.type_unknown:
+        return None
+    settings = inherit(source.inherited, source.own)
+    kind = _type(source, settings, driver, address, mistakes)
+    units = 1 if address.bit is not None else kind.words // (2 if area.unit is Unit.DWORD else 1)
+    span = Span(area.name, address.number, units)
+    write = _write(source, settings, driver, span, kind, mistakes)
+    facts = Facts(
+        kind=kind,
+        text=source.own.address,
+        settings=settings,
+        spell=lambda: driver.spell(Address(area.name, span.start)),
+        station=driver.station,
+        area=area,
+        bit=address.bit,
+        write=write,
+    )
+    for place, problem in _misfits(driver, span, facts):
+        mistakes.add((*source.path, place), problem)
+    check(source, facts, mistakes)
+    if len(mistakes) > before:
+        return None
+    return made(
+        source,
+        facts,
+        mistakes,
+        address=address,
+        span=span,
+        unit_kind=area.unit,
+        layout=layout_of(source.own, settings, driver, area, kind),
+    )
+
+
+def check(source: TagSource, facts: Facts, mistakes: Mistakes) -> None:
+    """Notes the settings of the tag that do not fit it."""
+    checks = _features(frozenset(source.own.model_fields_set)).checks
+    for check in (needs_write, *checks):
+        for place, problem in check(source.own, facts):
+            mistakes.add((*source.path, place), problem)
+
+
+class _Used(NamedTuple):
+    """The functions of the features that some settings belong to."""
+
+    checks: Sequence[Callable[[Any, Facts], Iterable[Problem]]]
+    makes: Sequence[tuple[str, Callable[[Any, Facts], object | None]]]
+    wraps: Sequence[Callable[[Any, Any, Tag], Tag]]
+
+
+@lru_cache(maxsize=1024)
+def _features(given: frozenset[str]) -> _Used:
+    used = [one for one in FEATURES if not one.names.isdisjoint(given)]
+    return _Used(
+        [one.check for one in used if one.check is not None],
+        [(one.slot, one.make) for one in used if one.make is not None],
+        [one.wrap for one in used if one.wrap is not None],
+    )
+
+
+def kept_by(source: TagSource, facts: Facts) -> Mapping[str, Any]:
+    """Returns the arguments of `Tag` that its features make."""
+    found: dict[str, Any] = {}
+    others = []
+    for slot, make in _features(frozenset(facts.settings.model_fields_set)).makes:
+        if (kept := make(source.own, facts)) is None:
+            continue
+        if slot:
+            found[slot] = kept
+        else:
+            others.append(kept)
+    found["features"] = tuple(others)
+    return found
+
+
+def made(source: TagSource, facts: Facts, mistakes: Mistakes, **place: Any) -> Tag:
+    """Returns the tag of checked settings. `place`: more arguments of `Tag`."""
+    tag = Tag(
+        device=source.device,
+        name=source.name,
+        text=source.own.address,
+        every=facts.settings.every,
+        write=facts.write,
+        **place,
+        **kept_by(source, facts),
+    )
+    for setting, problem in check_bounds(source.own, tag):
+        mistakes.add((*source.path, "write", setting), problem)
+    for wrap in _features(frozenset(facts.settings.model_fields_set)).wraps:
+        tag = wrap(source.own, facts.settings, tag)
+    return tag
+
+
+def address_of(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Address | None:
+    """Returns the address of the tag, or None after the mistake was noted."""
+    try:
+        return driver.address(source.own.address)
+    except ConfigError as error:
+        mistakes.add((*source.path, "address"), str(error))
+        return None
+
+
+def _type(
+    source: TagSource,
+    settings: Any,
+    driver: Addressing,
+    address: Address,
+    mistakes: Mistakes,
+) -> ValueType:
+    area = driver.areas[address.area]
+    default = default_type(driver, Unit.BIT if address.bit is not None else area.unit)
+    wanted: ValueType | None = settings.type
+    if wanted is None:
+        return default
+    misfit = type_misfit(wanted, area, address, driver)
+    if misfit is None:
+        return wanted
+    if source.sets("type"):
+        mistakes.add((*source.path, "type"), misfit)
+    return default
+
+
+def _misfits(driver: Addressing, span: Span, facts: Facts) -> Iterator[Problem]:
+    """Yields what is wrong with the size of the tag."""
+    area, kind = driver.areas[span.area], facts.kind
+    cost = driver.cost(span) if area.readable else driver.write_cost(span)
+    size = f"{span.size} {_SIZES[area.unit]}"
+    if span.start + span.size - 1 > area.last:
+        last = driver.spell(Address(area.name, area.last))
+        yield "address", f"a {kind} at {facts.name} takes {size}, but the last is {last}"
+    elif cost is None:
+        most = most_that_fits(driver, span, kind, write=not area.readable) if kind.count else ""
+        yield "type", f"a {kind} is {size}, more than one request can carry{most}"
+
+
+def _write(
+    source: TagSource,
+    settings: Any,
+    driver: Addressing,
+    span: Span,
+    kind: ValueType,
+    mistakes: Mistakes,
+) -> WriteRule | None:
+    """Returns the rule for writing; None where the tag cannot be written."""
+    setting, path = settings.write, (*source.path, "write")
+    if setting is False:
+        return None
+    own, spelt = source.sets("write"), source.own.address
+    area = driver.areas[span.area]
+    if not area.writable:
+        if own:
+            mistakes.add(path, f"{spelt} is read-only: {area.name} cannot be written")
+        return None
+    # A long array is written with several requests, each of whole elements.
+    least = span._replace(size=span.size // kind.count) if kind.count else span
+    if area.readable and driver.cost(span) is not None and driver.write_cost(least) is None:
+        if own:
+            mistakes.add(path, f"{spelt} cannot be written with one request")
+        return None
+    return rule_of(setting, kind)

@@ -1,0 +1,1 @@
+"""Templates: devices that are written once, with parameters."""

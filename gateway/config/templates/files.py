@@ -1,0 +1,154 @@
+"""The templates of a file: its own, those of files beside it, and those that are shipped."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple
+
+from gateway.config.messages import ConfigErrors, Mistakes, Path, shown, similar
+from gateway.config.templates.places import Origin
+from gateway.config.templates.text import PARAMETER
+from gateway.config.yaml.file import YamlFile, read_yaml
+
+Note = Callable[[Origin, str], None]
+SHIPPED = FilePath(__file__).parent / "shipped"
+_RESERVED = {"n", "i", "use", "repeat", "tags", "defaults", "parameters"}
+_NO_BODY = {"parameters", "use", "description"}
+
+
+class Template(NamedTuple):
+    """One template. `parameters`: their defaults, None where a device must give a value."""
+
+    name: str
+    file: YamlFile
+    path: Path
+    body: Mapping[str, Any]
+    parameters: Mapping[str, Any]
+    use: object
+    bases: tuple[str, ...] = ()  # that it uses itself
+
+
+@dataclass(slots=True)
+class Templates:
+    """Finds templates by name, and notes mistakes in their files."""
+
+    file: YamlFile
+    mistakes: Mistakes
+    folder: FilePath
+    _known: dict[str, Template] = field(default_factory=dict)
+    _has_shipped: bool = False
+
+    def __post_init__(self) -> None:
+        self._take(self.file, self.mistakes)
+        names = self.file.data.get("templates_from")
+        if names is None:
+            return
+        if isinstance(names, str):
+            names = [names]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            what = f"{shown(names)} is no list of files: write [pumps.yaml]"
+            self.mistakes.add(("templates_from",), what)
+            return
+        for name in names:
+            self._read(self.folder / name, ("templates_from",))
+
+    def used(self, use: object, at: Origin, note: Note) -> list[Template]:
+        """Returns the templates that `use` names, each after those that it uses itself.
+
+        Notes what is wrong, and returns nothing then. `at`: where `use` is written.
+        """
+        wrong = list[str]()
+
+        def noted(where: Origin, what: str) -> None:
+            wrong.append(what)
+            note(where, what)
+
+        found = list(self._used(use, at, noted, ()))
+        return [] if wrong else found
+
+    def _used(
+        self, use: object, at: Origin, note: Note, users: tuple[str, ...]
+    ) -> Iterator[Template]:
+        for name in use if isinstance(use, list) else [use]:
+            if not isinstance(name, str):
+                note(at, f"{shown(name)} is no name of a template")
+            elif name in users:
+                way = " uses ".join([*users[users.index(name) :], name])
+                note(at, f"templates use each other without end: {way}")
+            elif (template := self._find(name)) is None:
+                note(at, f"there is no template {name}{self._hint(name)}")
+            else:
+                bases = list[Template]()
+                if template.use is not None:
+                    by = at.by or (str(at.path[-2]), at.path[:-1])
+                    place = Origin(template.file, (*template.path, "use"), by)
+                    bases = list(self._used(template.use, place, note, (*users, name)))
+                yield from bases
+                yield template._replace(bases=tuple(base.name for base in bases))
+
+    def _find(self, name: str) -> Template | None:
+        if name not in self._known and not self._has_shipped:
+            self._has_shipped = True
+            for file in sorted(SHIPPED.glob("*.yaml")):
+                shipped, mistakes = read_yaml(file, self.file.texts)
+                shipped.name = f"{file.name} (shipped)"
+                self._take(shipped, mistakes)
+        return self._known.get(name)
+
+    def _hint(self, name: str) -> str:
+        if close := similar(name, self._known):
+            return f": did you mean {close}?"
+        own = [known for known in self._known if "/" not in known]
+        has = f"the file has {', '.join(own)}; " if own else ""
+        return f": {has}docs/templates.md has those that are shipped"
+
+    def _read(self, path: FilePath, place: Path) -> None:
+        try:
+            file, mistakes = read_yaml(path, self.file.texts)
+        except ConfigErrors as error:
+            for message in error.messages:
+                self.mistakes.add(place, message)
+            return
+        self.mistakes.include(mistakes)
+        for name in file.data.keys() - {"templates"}:
+            mistakes.add((name,), "a file of templates has `templates:` only")
+        self._take(file, mistakes)
+
+    def _take(self, file: YamlFile, mistakes: Mistakes) -> None:
+        raw = file.data.get("templates")
+        if raw is None:
+            return
+        if not isinstance(raw, dict):
+            what = f"{shown(raw)} stands where templates are expected, each as `name: settings`"
+            mistakes.add(("templates",), what)
+            return
+        for name, body in raw.items():
+            path: Path = ("templates", name)
+            if not isinstance(body, dict):
+                mistakes.add(path, f"{shown(body)} stands where settings are expected")
+                continue
+            if (other := self._known.get(name)) is not None:
+                at = f"{other.file.name}:{other.file.line(other.path)}"
+                mistakes.add(path, f"a template {name} is in {at} already")
+                continue
+            settings = {key: value for key, value in body.items() if key not in _NO_BODY}
+            parameters = _parameters(body.get("parameters"), path, mistakes)
+            self._known[name] = Template(name, file, path, settings, parameters, body.get("use"))
+
+
+def _parameters(raw: object, path: Path, mistakes: Mistakes) -> dict[str, Any]:
+    """Returns the defaults by name. A list has parameters without defaults."""
+    place = (*path, "parameters")
+    if raw is None:
+        return {}
+    if isinstance(raw, list):
+        raw = dict.fromkeys(map(str, raw))
+    if not isinstance(raw, dict):
+        mistakes.add(place, f"{shown(raw)} stands where parameters are expected: [base, count]")
+        return {}
+    for name in raw:
+        if not PARAMETER.match(name):
+            mistakes.add((*place, name), f"{name}: a parameter has letters, digits and _ only")
+        elif name in _RESERVED:
+            mistakes.add((*place, name), f"{name} has a meaning of its own: choose another name")
+    return raw

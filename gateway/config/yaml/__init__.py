@@ -1,0 +1,1 @@
+"""YAML files: text to plain data that knows its lines, and back."""
