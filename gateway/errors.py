@@ -7,6 +7,8 @@ GatewayError
 │   ├── NotSent          a write of a group, after another one that was not done
 │   └── Superseded       a newer write of the same tag took its place: do not try again
 ├── Unknown              there is no such thing; nothing was done
+├── NotAllowed           sign the request; nothing was done
+├── Repeated             a signed request arrived twice: the first one may have been done
 ├── NothingToAcknowledge look at the alarm again
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
@@ -44,6 +46,14 @@ class NotSent(Busy):
 
 class Unknown(GatewayError):
     """A request to something that is not there; nothing was done."""
+
+
+class NotAllowed(GatewayError):
+    """The signature is missing, wrong or too old; nothing was done."""
+
+
+class Repeated(GatewayError):
+    """A signed request arrived twice. The first one may have been done."""
 
 
 class NothingToAcknowledge(GatewayError):

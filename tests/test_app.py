@@ -21,6 +21,7 @@ from gateway.transport import Receiver
 from tests.e2e.processes import vigor_line, write_config
 from tests.sim.bench import WIRE, Bench, Unruly
 from tests.sim.virtual import on_virtual_time
+from tests.writing import write
 
 TAGS = {
     "speed": {"address": "D10"},
@@ -99,7 +100,7 @@ async def test_a_line_that_is_not_planned_refuses_writes(
     watched = Watched(Plant(load(path), plan_now=False))
     gateway, recipe = watched.gateway, tag(watched, "recipe")
     with pytest.raises(LineDown, match="line hall is not open"):
-        await gateway.write(recipe, 7)
+        await write(gateway, recipe, 7)
     assert (await gateway.fresh(recipe, 0.0)).reason is Reason.STARTING
     assert {"status", "devices/mixer"} <= gateway.status().keys()
     assert "lines/hall" not in gateway.status()
@@ -108,7 +109,7 @@ async def test_a_line_that_is_not_planned_refuses_writes(
     assert "lines/hall" in gateway.status()
     async with running(watched):
         await watched.until_good("mixer/recipe")
-        assert (await gateway.write(recipe, 7)).acknowledged
+        assert (await write(gateway, recipe, 7)).acknowledged
 
 
 async def test_values_are_published_and_kept(tmp_path: Path) -> None:
@@ -124,7 +125,7 @@ async def test_values_are_published_and_kept(tmp_path: Path) -> None:
 async def test_a_verified_write_returns_the_value_of_the_device(tmp_path: Path) -> None:
     async with running(made(tmp_path)) as watched:
         await watched.until_good("mixer/recipe")
-        written = await watched.gateway.write(tag(watched, "recipe"), 7)
+        written = await write(watched.gateway, tag(watched, "recipe"), 7)
         assert (written.value, written.verified, written.acknowledged) == (7, True, True)
         assert 0 < written.took < 5
         fresh = await watched.gateway.fresh(tag(watched, "recipe"), 0.0)
@@ -136,7 +137,7 @@ async def test_a_bad_value_is_never_sent(tmp_path: Path, value: Any) -> None:
     async with running(made(tmp_path)) as watched:
         await watched.until_good("mixer/recipe")
         with pytest.raises(BadValue):
-            await watched.gateway.write(tag(watched, "recipe"), value)
+            await write(watched.gateway, tag(watched, "recipe"), value)
         [line] = watched.gateway.lines
         assert line.engine.devices[0].record.writes == 0
 
@@ -144,7 +145,7 @@ async def test_a_bad_value_is_never_sent(tmp_path: Path, value: Any) -> None:
 async def test_a_write_to_a_line_that_is_not_open_fails_at_once(tmp_path: Path) -> None:
     watched = made(tmp_path)
     with pytest.raises(LineDown):
-        await watched.gateway.write(tag(watched, "recipe"), 7)
+        await write(watched.gateway, tag(watched, "recipe"), 7)
 
 
 async def test_a_disabled_device_gets_no_request(tmp_path: Path) -> None:
@@ -152,7 +153,7 @@ async def test_a_disabled_device_gets_no_request(tmp_path: Path) -> None:
         gateway = watched.gateway
         assert {gateway.sample(tag(watched, name)).reason for name in TAGS} == {Reason.DISABLED}
         with pytest.raises(Offline, match="device mixer is disabled"):
-            await gateway.write(tag(watched, "recipe"), 7)
+            await write(gateway, tag(watched, "recipe"), 7)
         assert (await gateway.fresh(tag(watched, "speed"), 0.0)).reason is Reason.DISABLED
         assert [line.engine.devices for line in gateway.lines] == [[]]
 

@@ -42,13 +42,13 @@ def write(
     known = tags_by_key(loaded)
     if any(device.name == tag for device in loaded.devices):
         group = _group(config, known, tag, values)
-        answer = _write_group(loaded, tag, group, known, directly=without_gateway)
+        answer = _write(loaded, tag, group, directly=without_gateway)
         lines = _group_lines(tag, answer)
     else:
         if len(values) > 1:
             raise ConfigError(f"{tag} takes one value; for several tags name their device")
         value = _value(config, known, tag, values[0])
-        answer = _write_one(loaded, known[tag], value, directly=without_gateway)
+        answer = _write(loaded, tag, {known[tag]: value}, directly=without_gateway)
         lines = [(tag, answer)]
     if as_json:
         print(json.dumps(answer))
@@ -65,18 +65,19 @@ def write(
 
 def _group(
     config: Path, known: Mapping[str, Tag], device: str, texts: Sequence[str]
-) -> dict[str, Value]:
+) -> dict[Tag, Value]:
     """Returns the values by tag. Raises `ConfigError` with every mistake."""
-    group, mistakes = dict[str, Value](), list[str]()
+    group, mistakes = dict[Tag, Value](), list[str]()
     for text in texts:
         name, is_pair, value = text.partition("=")
         if not is_pair:
             mistakes.append(f"{text} is no tag=value, as in {device} recipe/a=1 recipe/b=2")
-        elif name in group:
+        elif known.get(f"{device}/{name}") in group:
             mistakes.append(f"{device}/{name} is named twice")
         else:
             try:
-                group[name] = _value(config, known, f"{device}/{name}", value)
+                parsed = _value(config, known, f"{device}/{name}", value)
+                group[known[f"{device}/{name}"]] = parsed
             except (ConfigError, BadValue) as error:
                 mistakes.append(str(error))
     if mistakes:
@@ -101,37 +102,33 @@ def _value(config: Path, known: Mapping[str, Tag], name: str, text: str) -> Valu
     return parsed
 
 
-def _write_one(config: Config, tag: Tag, value: Value, *, directly: bool) -> dict[str, object]:
-    if directly:
-        return _write_directly(config, tag, value)
-    with connected(config, err.print) as client:
-        return client.write(tag.key, value)
-
-
-def _write_group(
-    config: Config,
-    device: str,
-    values: Mapping[str, Value],
-    known: Mapping[str, Tag],
-    *,
-    directly: bool,
+def _write(
+    config: Config, target: str, values: Mapping[Tag, Value], *, directly: bool
 ) -> dict[str, object]:
+    """Writes one tag, or several of the device `target`. Returns the outcome in the words of a
+    gateway."""
+    is_group = target not in {tag.key for tag in values}
     if not directly:
         with connected(config, err.print) as client:
-            return client.write(device, dict(values))
+            if is_group:
+                return client.write(target, {tag.name: value for tag, value in values.items()})
+            [value] = values.values()
+            return client.write(target, value)
     from gateway.cli.line import direct
 
-    tags = [(known[f"{device}/{name}"], value) for name, value in values.items()]
     started = time.monotonic()
     try:
-        ends = direct.run(direct.write_group(config, tags))
+        ends = direct.run(direct.write_group(config, [*values.items()]))
     except GatewayError as error:
         return _decoded(payload.outcome(payload.failure(error)))
     results = {
-        name: payload.failure(end) if isinstance(end, GatewayError) else end
-        for name, end in zip(values, ends, strict=True)
+        tag.name: payload.failure(end) if isinstance(end, GatewayError) else end
+        for tag, end in zip(values, ends, strict=True)
     }
-    return _decoded(payload.outcome(payload.GroupResult(results, time.monotonic() - started)))
+    if is_group:
+        return _decoded(payload.outcome(payload.GroupResult(results, time.monotonic() - started)))
+    [result] = results.values()
+    return _decoded(payload.outcome(result))
 
 
 def _group_lines(device: str, answer: dict[str, object]) -> list[tuple[str, dict[str, object]]]:
@@ -152,16 +149,6 @@ def _parsed(text: str, tag: Tag) -> Value:
     if kind is Kind.STRING and not isinstance(parsed, str):
         return text  # 12 is a text for this tag
     return parsed
-
-
-def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]:
-    """Writes without a gateway. Returns the outcome in the words of a gateway."""
-    from gateway.cli.line import direct
-
-    try:
-        return _decoded(payload.outcome(direct.run(direct.write(config, tag, value))))
-    except GatewayError as error:
-        return _decoded(payload.outcome(payload.failure(error)))
 
 
 def _decoded(encoded: bytes) -> dict[str, object]:

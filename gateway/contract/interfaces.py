@@ -61,18 +61,14 @@ class Plant(Lines, Protocol):
         """Notes samples that are about to be published again: later changes are measured against
         them."""
 
-    async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
-        """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
-        only when nothing was sent: after `within` seconds nothing is sent any more. Cancelled when
-        the client no longer waits."""
-
     async def write_group(
         self, values: Sequence[tuple[Tag, Value]], within: float, patience: float
     ) -> Sequence[WriteResult | GatewayError]:
         """Writes tags of one device in their order. Returns the outcome of each, at the latest
         after `patience` seconds: what has not ended then is `Unclear`. After the first that is not
-        done the others are `NotSent`. Raises `GatewayError` when nothing was sent; `within` as in
-        `write`."""
+        done the others are `NotSent`. After `within` seconds nothing is sent any more. Raises
+        `GatewayError`; `Busy` and `BadValue` only when nothing was sent. Cancelled when the client
+        no longer waits."""
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         """By device: the commands of its protocol, allowed or not."""

@@ -4,12 +4,13 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Never
+from typing import Never, TypeVar
 
 from gateway.errors import BadValue
 from gateway.values import LONGEST_ARRAY, Value
 from gateway.values.numerals import Scalar, parse_decimal
 
+T = TypeVar("T")
 LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters or 2000 elements at most
 LARGEST_GROUP = 256  # tags
 # Most clients name no encoding: Zenoh's default is `zenoh/bytes`.
@@ -42,18 +43,23 @@ def parse_group(payload: bytes) -> list[tuple[str, Value | BadValue]]:
         raise BadValue('send the tags and values as one object: {"recipe/a": 1, "recipe/b": 2}')
     if len(found) > LARGEST_GROUP:
         raise BadValue(f"{len(found)} tags are written at once, more than {LARGEST_GROUP}")
-    return [(_text(name), _value_or_error(value)) for name, value in found]
+    return [(_text(name), parsed(_member, value)) for name, value in found]
+
+
+def parsed(parse: Callable[[T], Value], data: T) -> Value | BadValue:
+    """Returns the value, or why there is none."""
+    try:
+        return parse(data)
+    except BadValue as error:
+        return error
 
 
 class _Pairs(list[tuple[str, object]]):
     """The members of an object."""
 
 
-def _value_or_error(found: object) -> Value | BadValue:
-    try:
-        return _value(_only_value(found) if isinstance(found, _Pairs) else found)
-    except BadValue as error:
-        return error
+def _member(found: object) -> Value:
+    return _value(_only_value(found) if isinstance(found, _Pairs) else found)
 
 
 def _loaded(payload: bytes, of_object: Callable[[list[tuple[str, object]]], object]) -> object:

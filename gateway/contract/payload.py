@@ -21,10 +21,12 @@ from gateway.errors import (
     Damaged,
     GatewayError,
     LineDown,
+    NotAllowed,
     NothingToAcknowledge,
     NotSent,
     Offline,
     Refused,
+    Repeated,
     Unknown,
 )
 from gateway.tags import Quality, Reason, Sample, WriteResult
@@ -55,6 +57,21 @@ class Problem(StrEnum):
     BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
     DAMAGED = "damaged"  # a part of the history file is lost; all the rest was answered
     NO_HISTORY = "no-history"  # a read of the past from a gateway without history
+
+
+# Of the most special class of an error. All others are unclear.
+_PROBLEMS: Mapping[type, Problem] = {
+    NotSent: Problem.NOT_SENT,
+    BadValue: Problem.BAD_VALUE,
+    Refused: Problem.REFUSED,
+    LineDown: Problem.LINE_DOWN,
+    Busy: Problem.BUSY,
+    Offline: Problem.NO_REPLY,
+    Damaged: Problem.DAMAGED,
+    Unknown: Problem.UNKNOWN_TAG,
+    NotAllowed: Problem.NOT_ALLOWED,
+    NothingToAcknowledge: Problem.NOTHING_TO_ACKNOWLEDGE,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,28 +132,17 @@ class WriteOutcome:
 def failure(error: GatewayError) -> Failure:
     """Translates an error for the client. An error after which the request may have been done is
     unclear."""
-    reason = str(error) or type(error).__name__
-    match error:
-        case NotSent():
-            return Failure(Problem.NOT_SENT, reason)
-        case BadValue():
-            return Failure(Problem.BAD_VALUE, reason)
-        case Refused(code=code):
-            return Failure(Problem.REFUSED, reason, code)
-        case LineDown():
-            return Failure(Problem.LINE_DOWN, reason)
-        case Busy():
-            return Failure(Problem.BUSY, reason)
-        case Offline():
-            return Failure(Problem.NO_REPLY, reason)
-        case Damaged():
-            return Failure(Problem.DAMAGED, reason)
-        case Unknown():
-            return Failure(Problem.UNKNOWN_TAG, reason)
-        case NothingToAcknowledge():
-            return Failure(Problem.NOTHING_TO_ACKNOWLEDGE, reason)
-        case _:
-            return Failure(Problem.UNCLEAR, reason)
+    kinds = type(error).__mro__
+    problem = next((_PROBLEMS[kind] for kind in kinds if kind in _PROBLEMS), Problem.UNCLEAR)
+    code = error.code if isinstance(error, Refused) else None
+    return Failure(problem, str(error) or type(error).__name__, code)
+
+
+def audited(error: GatewayError) -> Failure:
+    """Translates an error for the audit. The repetition itself was not sent."""
+    if isinstance(error, Repeated):
+        return Failure(Problem.NOT_ALLOWED, str(error))
+    return failure(error)
 
 
 # -- out ---------------------------------------------------------------------------------------

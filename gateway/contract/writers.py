@@ -16,20 +16,12 @@ from typing import NamedTuple
 
 from gateway.contract import signatures
 from gateway.contract.named_secrets import NamedSecrets
-from gateway.errors import GatewayError
+from gateway.errors import NotAllowed, Repeated
 from gateway.tags.timestamps import rfc3339
 
 LATEST, EARLIEST = 5.0, 1.0  # seconds that a signature may be old, or ahead of our clock
 KEPT = 3600.0  # seconds that a nonce is kept
 MOST_KEPT = 20_000  # nonces
-
-
-class NotAllowed(GatewayError):
-    """The signature is missing, wrong or too old; nothing was done."""
-
-
-class Repeated(GatewayError):
-    """A signed request arrived twice. The first one may have been done."""
 
 
 class _Use(NamedTuple):

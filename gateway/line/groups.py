@@ -23,7 +23,12 @@ async def ended(
         try:
             found.append(write.result())
         except asyncio.CancelledError:
-            found.append(Unclear(f"not acknowledged within {patience:g} s: it may yet be done"))
+            found.append(not_acknowledged(patience))
         except GatewayError as error:
             found.append(error)
     return found
+
+
+def not_acknowledged(patience: float) -> Unclear:
+    """Returns the outcome of a write that has not ended after so many seconds."""
+    return Unclear(f"not acknowledged within {patience:g} s: it may yet be done")

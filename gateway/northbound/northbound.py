@@ -29,7 +29,7 @@ from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming
-from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.northbound.requests.writes import OwnWrites
 from gateway.northbound.session import dead_routes, exposures
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.northbound.session.one_process import only_process

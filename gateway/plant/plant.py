@@ -285,9 +285,6 @@ class Plant:
         if changed := self.mirror.mark_published(samples):
             self._publish(changed)  # history keeps it too
 
-    async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
-        return await self._requests.write(tag, value, within)
-
     async def write_group(
         self,
         values: Sequence[tuple[Tag, Value]],

@@ -7,7 +7,7 @@ from typing import Protocol
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
-from gateway.line.groups import ended
+from gateway.line.groups import ended, not_acknowledged
 from gateway.line.line import Line
 from gateway.protocols.driver import Address
 from gateway.protocols.ranges import addresses, spans
@@ -44,18 +44,6 @@ class WritePath:
         self._stores = stores
         self._wall = wall
 
-    async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
-        """Returns when the device has acknowledged."""
-        if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
-            place = self._places.get(tag.device)
-            if place is None or tag not in place[1].settings.targets:
-                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
-        if (store := self._store(tag)) is not None:
-            [result] = await store.write_group([(tag, value)])
-            return result
-        line, device = self._place(tag.device)
-        return await line.write(device, tag, tag.encode(value), within)
-
     async def write_group(
         self,
         values: Sequence[tuple[Tag, Value]],
@@ -66,12 +54,19 @@ class WritePath:
 
         What has not ended after `patience` seconds is `Unclear`. It raises when nothing was sent.
         """
-        name = values[0][0].device
-        if any(self._tags.get(tag.key) is not tag for tag, _ in values):
-            raise Busy(f"the file was reloaded, and {name} with it; not sent")
-        if (store := self._store(values[0][0])) is not None:
-            return await store.write_group(values)
-        line, device = self._place(name)
+        first = values[0][0]
+        place = self._places.get(first.device)
+        targets = () if place is None else place[1].settings.targets
+        for tag, _ in values:  # its scale or limits may be others now
+            if self._tags.get(tag.key) is not tag and tag not in targets:
+                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
+        if (store := next((one for one in self._stores if one.holds(first)), None)) is not None:
+            try:
+                async with asyncio.timeout(patience):
+                    return await store.write_group(values)
+            except TimeoutError:
+                raise not_acknowledged(patience) from None
+        line, device = self._place(first.device)
         units = [(tag, tag.encode(value)) for tag, value in values]
         return await ended(line.write_group(device, units, within), patience)
 
@@ -109,9 +104,6 @@ class WritePath:
         """Returns the seconds that a request may wait for a telephone call; 0: for none."""
         place = self._places.get(device)
         return 0.0 if place is None else place[0].dialling
-
-    def _store(self, tag: Tag) -> Store | None:
-        return next((store for store in self._stores if store.holds(tag)), None)
 
     def _place(self, device: str) -> tuple[Line, Device]:
         if device not in self._places:

@@ -14,6 +14,7 @@ from gateway.plant.build import line_of
 from gateway.plant.plant import Plant
 from gateway.transport import Port, Receiver
 from tests.sim.virtual import on_virtual_time
+from tests.writing import write
 
 EXAMPLE = Path(__file__).parents[2] / "config.example.yaml"
 Log = list[LoggedPiece | LoggedValue]
@@ -37,7 +38,7 @@ async def recorded(config: Config, seconds: float) -> dict[str, Log]:
     await asyncio.sleep(seconds)
     recipe = gateway.tag("mixer/recipe")
     assert recipe is not None
-    await gateway.write(recipe, 7)
+    await write(gateway, recipe, 7)
     await asyncio.sleep(seconds)
     for line in lines:
         line.cancel()

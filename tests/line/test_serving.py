@@ -17,6 +17,7 @@ from gateway.transport import TcpAddress, listen
 from gateway.values import Value
 from tests.interop.peers import free_port
 from tests.parts.made import parts_of
+from tests.writing import write
 
 TAGS = {
     "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
@@ -49,9 +50,9 @@ def tag(of: Plant, name: str) -> Tag:
 
 async def test_a_held_value_is_on_the_disk_before_it_is_acknowledged(tmp_path: Path) -> None:
     first = gateway(tmp_path)
-    assert (await first.write(tag(first, "limit"), 42)).value == 42
-    assert (await first.write(tag(first, "name"), "AB")).value == "AB"
-    assert (await first.write(tag(first, "steps"), (1, -2, 3))).value == (1, -2, 3)
+    assert (await write(first, tag(first, "limit"), 42)).value == 42
+    assert (await write(first, tag(first, "name"), "AB")).value == "AB"
+    assert (await write(first, tag(first, "steps"), (1, -2, 3))).value == (1, -2, 3)
     again = gateway(tmp_path)
     await served(again).begin()
     assert again.sample(tag(again, "limit")).value == 42
@@ -61,14 +62,14 @@ async def test_a_held_value_is_on_the_disk_before_it_is_acknowledged(tmp_path: P
 
 async def test_a_value_that_cannot_be_kept_is_refused_and_not_shown(tmp_path: Path) -> None:
     one = gateway(tmp_path)
-    await one.write(tag(one, "limit"), 42)
+    await write(one, tag(one, "limit"), 42)
     (tmp_path / "state.held.json").unlink()
     tmp_path.rmdir()
     with pytest.raises(Busy, match="No such file or directory; not done"):
-        await one.write(tag(one, "limit"), 43)
+        await write(one, tag(one, "limit"), 43)
     assert one.sample(tag(one, "limit")).value == 42
     with pytest.raises(BadValue):
-        await one.write(tag(one, "limit"), 51)
+        await write(one, tag(one, "limit"), 51)
 
 
 async def test_several_held_values_change_all_at_once_or_none(tmp_path: Path) -> None:
@@ -106,7 +107,7 @@ async def test_direct_access_sends_nothing_on_the_wire_of_a_master(tmp_path: Pat
     [sample] = await direct.read(config, [order])
     assert sample.reason is Reason.LINE_DOWN
     with pytest.raises(BadValue, match="only the running gateway has it"):
-        await direct.write(config, limit, 1)
+        await direct.write_group(config, [(limit, 1)])
 
 
 async def test_a_connection_ends_with_bytes_that_are_no_modbus_and_the_next_is_served(

@@ -13,10 +13,10 @@ from gateway.contract.payload import Failure, GroupResult, Problem, WriteOutcome
 from gateway.errors import BadValue, Busy, NoReply, Refused
 from gateway.line.send_permit import Duty
 from gateway.northbound.answering.tag_index import TagIndex
-from gateway.northbound.requests import group_writes
+from gateway.northbound.requests import writes
 from gateway.northbound.requests.acceptance import Acceptance, Sender
-from gateway.northbound.requests.group_writes import GroupWrites
-from gateway.tags import WriteRule
+from gateway.northbound.requests.writes import Writes
+from gateway.tags import WriteResult, WriteRule
 from tests.northbound.plant import PlainDevice, PlainPlant, gateway_and_client, tag
 
 RULE = WriteRule(min=0, max=4000)
@@ -36,7 +36,7 @@ class Rig:
         self.audit: list[WriteOutcome] = []
         index = TagIndex(keys, plant.devices())
         accepts = Acceptance(Duty(), None)
-        self.writes = GroupWrites(plant, index, self.audit.append, accepts, 8.0)
+        self.writes = Writes(plant, index, self.audit.append, accepts)
 
     def write(self, data: object, *, arrived: float | None = None) -> GroupResult | Failure:
         sent = data if isinstance(data, bytes) else json.dumps(data).encode()
@@ -44,7 +44,9 @@ class Rig:
         async def ask() -> GroupResult | Failure:
             at = asyncio.get_running_loop().time() if arrived is None else arrived
             sender = Sender("alice", None, at)
-            return await self.writes.write("plant/mixer/@set", "plant/mixer", sent, sender)
+            result = await self.writes.write("plant/mixer/@set", sent, sender)
+            assert not isinstance(result, WriteResult)
+            return result
 
         return asyncio.run(ask())
 
@@ -133,7 +135,7 @@ def test_a_group_of_the_past_is_not_sent() -> None:
 
 
 def test_with_many_groups_waiting_the_next_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(group_writes, "MOST_WAITING", 0)
+    monkeypatch.setattr(writes, "MOST_WAITING", 0)
     rig = Rig(recipes())
     result = rig.write({"recipe/a": 1})
     assert isinstance(result, Failure)

@@ -20,11 +20,9 @@ from gateway.contract.writers import (
     KEPT,
     LATEST,
     MOST_KEPT,
-    NotAllowed,
-    Repeated,
     Writers,
 )
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, NotAllowed, Repeated
 from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery

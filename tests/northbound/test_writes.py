@@ -21,8 +21,7 @@ from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests import inbox
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
-from gateway.northbound.requests.own_writes import OwnWrites
-from gateway.northbound.requests.writes import MOST_WAITING, Writes
+from gateway.northbound.requests.writes import MOST_WAITING, OwnWrites, Writes
 from tests.northbound.plant import (
     gateway_and_client,
     mixer,

@@ -19,6 +19,7 @@ from gateway.service.bulkheads import CALL_WITHIN, PAUSE_FIRST, PAUSE_LONGEST, B
 from gateway.tags import Quality, Sample, Tag
 from tests.parts.made import Silent
 from tests.sim.virtual import on_virtual_time
+from tests.writing import write
 
 DATA: dict[str, Any] = {
     "lines": {
@@ -140,7 +141,7 @@ class Running:
         now = self.plant.sample(self.level)
         assert now.quality is Quality.GOOD
         assert now.time >= before
-        assert (await self.plant.write(self.recipe, 7)).value == 7
+        assert (await write(self.plant, self.recipe, 7)).value == 7
 
     def said(self) -> list[str]:
         documents: Any = {**self.plant.status(), "zenoh": {}, "outcomes": {}}

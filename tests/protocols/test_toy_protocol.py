@@ -25,7 +25,7 @@ from gateway.simulator.plant import station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations import registry as stations
 from gateway.stations.station import Memory
-from gateway.tags import Quality
+from gateway.tags import Quality, WriteResult
 from gateway.transport import Port, Receiver, SerialSettings
 from gateway.values import Kind
 from tests.e2e.processes import write_config
@@ -236,7 +236,8 @@ async def test_it_is_polled_and_written_on_a_simulated_line(tmp_path: Path) -> N
     tags = {tag.name: tag for device in loaded.devices for tag in device.tags}
     samples = await direct.read(loaded, list(tags.values()))
     assert {sample.quality for sample in samples} == {Quality.GOOD}
-    result = await direct.write(loaded, tags["limit"], 42)
+    [result] = await direct.write_group(loaded, [(tags["limit"], 42)])
+    assert isinstance(result, WriteResult)
     assert (result.value, result.verified) == (42, True)
 
 

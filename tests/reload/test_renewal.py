@@ -20,6 +20,7 @@ from gateway.tags import Quality, Reason, Tag
 from tests.parts.made import find
 from tests.reload.plant import Data, Plant, file, running, vigor
 from tests.sim.virtual import on_virtual_time
+from tests.writing import write
 
 MIXER = {"mixer": vigor(1), "oven": vigor(2)}
 
@@ -90,7 +91,7 @@ async def test_tags_come_and_go_while_their_neighbours_stay() -> None:
         assert plant.sample("mixer/level").quality is Quality.GOOD
         await plant.until_good("mixer/more")
         with pytest.raises(Busy, match="the file was reloaded"):
-            await plant.gateway.write(recipe, 7)
+            await write(plant.gateway, recipe, 7)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +144,7 @@ async def test_a_waiting_write_to_a_changed_device_is_refused_and_one_in_flight_
         mixer, oven = plant.gateway.tag("mixer/recipe"), plant.gateway.tag("oven/recipe")
         assert mixer is not None
         assert oven is not None
-        writes = [asyncio.create_task(plant.gateway.write(tag, 7)) for tag in (mixer, mixer, oven)]
+        writes = [asyncio.create_task(write(plant.gateway, tag, 7)) for tag in (mixer, mixer, oven)]
         await asyncio.sleep(0.004)  # the first is on the wire
         await plant.reload(lambda data: device(data, "mixer").update(station=5))
         first, second, third = await asyncio.gather(*writes, return_exceptions=True)

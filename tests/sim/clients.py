@@ -28,6 +28,7 @@ from tests.sim.obeyed import (
 )
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
+from tests.writing import write
 
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
@@ -184,7 +185,7 @@ class Client:
 
     async def _outcome(self, tag: Tag, value: Value) -> WriteResult | GatewayError:
         try:
-            return await self.judge.gateway.write(tag, value)
+            return await write(self.judge.gateway, tag, value)
         except GatewayError as error:
             return error
 

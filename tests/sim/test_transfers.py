@@ -14,7 +14,7 @@ import pytest
 from gateway.config import LineConfig, built
 from gateway.contract.keys import Keys
 from gateway.northbound.requests.audit import Audit
-from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.alarms import Alarms, State
 from gateway.parts.alarms.part import AlarmPart
 from gateway.parts.transfers import Transfers

@@ -11,7 +11,7 @@ from gateway.contract.keys import Keys
 from gateway.engine.device.device import Device
 from gateway.errors import BadValue, GatewayError, Refused
 from gateway.northbound.requests.audit import Audit
-from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.transfers import Transfers
 from gateway.tags import Quality, Sample, Tag, WriteResult
 from gateway.tags.transfer import TransferRule

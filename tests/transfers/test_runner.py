@@ -13,7 +13,7 @@ from gateway.contract.keys import Keys
 from gateway.errors import Busy, Unclear
 from gateway.line.send_permit import Duty
 from gateway.northbound.requests.audit import Audit
-from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.transfers import Transfers
 from gateway.plant.on_demand import OnDemand
 from gateway.tags import Tag, WriteResult, good
@@ -24,6 +24,7 @@ from tests.northbound.plant import mixer
 from tests.reload.plant import Data, Plant, file, running, vigor
 from tests.sim.plant import make_tag
 from tests.sim.virtual import now, on_virtual_time
+from tests.writing import write
 
 SOURCE = {"n": {"address": "D10", "write": True}}
 TARGET = {"n": {"address": "D20", "write": True}, "m": {"address": "D21", "write": True}}
@@ -43,12 +44,12 @@ class Rig:
     async def _write(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
         assert within > 0
         self.written.append((now(), tag.key, value, by))
-        return await self.plant.gateway.write(tag, value, min(within, 5.0))
+        return await write(self.plant.gateway, tag, value, min(within, 5.0))
 
     async def put(self, value: Value) -> None:
         tag = self.plant.gateway.tag("a/n")
         assert tag is not None
-        await self.plant.gateway.write(tag, value)
+        await write(self.plant.gateway, tag, value)
         await asyncio.sleep(3)
 
     async def reload(self, change: Callable[[Data], object]) -> None:
@@ -191,7 +192,7 @@ async def test_a_range_is_carried_as_a_whole_and_goes_on_over_a_reload() -> None
         await made.reload(move)
         assert before is not None
         with pytest.raises(Busy, match="the file was reloaded"):
-            await gateway.write(before, (1, 2, 3))
+            await write(gateway, before, (1, 2, 3))
         assert made.row(1)["carried"] < count
         assert tuple((await gateway.peek("b", "D40..D42")).units)[:1] == (8,)
 

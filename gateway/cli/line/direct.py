@@ -116,26 +116,14 @@ async def follow(config: Config, sink: SampleSink) -> None:
     await asyncio.gather(*(line.run() for line in lines))
 
 
-async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
-    """Writes one tag. Raises `GatewayError`; `BadValue` only before anything is sent."""
-    units = tag.encode(value)
-    async with _writing(config, [tag]) as (line, device):
-        return await line.write(device, tag, units, WRITE_EXPIRY + line.dialling)
-
-
 async def write_group(
     config: Config, values: Sequence[tuple[Tag, Value]]
 ) -> list[WriteResult | GatewayError]:
-    """Writes tags of one device in their order; returns the outcome of each. Raises as `write`."""
-    units = [(tag, tag.encode(value)) for tag, value in values]
-    async with _writing(config, [tag for tag, _ in values]) as (line, device):
-        writes = line.write_group(device, units, WRITE_EXPIRY + line.dialling)
-        return await ended(writes, WRITE_WITHIN + line.dialling)
+    """Writes tags of one device in their order; returns the outcome of each.
 
-
-@asynccontextmanager
-async def _writing(config: Config, tags: Sequence[Tag]) -> AsyncIterator[tuple[Line, Device]]:
-    """Opens the line of the tags, which are of one device, and polls nothing."""
+    Raises `GatewayError`; `BadValue` only before anything is sent.
+    """
+    units, tags = [(tag, tag.encode(value)) for tag, value in values], [tag for tag, _ in values]
     first = tags[0]
     (line_config,) = (line for line in config.lines if first in line.tags)
     if line_config.serve:
@@ -143,11 +131,9 @@ async def _writing(config: Config, tags: Sequence[Tag]) -> AsyncIterator[tuple[L
     if not any(device.enabled for device in line_config.devices if device.name == first.device):
         raise BadValue(f"device {first.device} is disabled")
     line = _line(line_config, {first.device}, tags, _Once())
-    (device,) = line.engine.devices
-    device.poll_nothing()
-    async with _running(line):
-        await line.tried.wait()
-        yield line, device
+    async with _running_idle(line) as device:
+        writes = line.write_group(device, units, WRITE_EXPIRY + line.dialling)
+        return await ended(writes, WRITE_WITHIN + line.dialling)
 
 
 async def control(config: Config, device: str, command: str, argument: str) -> CommandResult:
@@ -155,10 +141,7 @@ async def control(config: Config, device: str, command: str, argument: str) -> C
     check_command(config, device, command)
     line_config = line_of(config, device)
     line = _line(line_config, {device}, line_config.tags, _Once())
-    (commanded,) = line.engine.devices
-    commanded.poll_nothing()
-    async with _running(line):
-        await line.tried.wait()
+    async with _running_idle(line) as commanded:
         loop = asyncio.get_running_loop()
         started = loop.time()
         within = WRITE_EXPIRY + line.dialling
@@ -174,6 +157,16 @@ def _line(config: LineConfig, devices: Collection[str], tags: Sequence[Tag], onc
         if device.name in devices
     ]
     return build.line_of(config, chosen, once)
+
+
+@asynccontextmanager
+async def _running_idle(line: Line) -> AsyncIterator[Device]:
+    """Opens the line of one device, and polls nothing."""
+    (device,) = line.engine.devices
+    device.poll_nothing()
+    async with _running(line):
+        await line.tried.wait()
+        yield device
 
 
 @asynccontextmanager

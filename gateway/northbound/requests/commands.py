@@ -16,7 +16,6 @@ from gateway.contract import payload
 from gateway.contract.interfaces import Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, Problem, WriteOutcome
-from gateway.contract.writers import NotAllowed, Repeated
 from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import BadValue, GatewayError
 from gateway.northbound.publishing import encoding
@@ -66,15 +65,10 @@ class Commands:
         except TimeoutError:
             reason = f"not answered within {longest:g} s: it may yet be done"
             result = Failure(Problem.UNCLEAR, reason)
-        except NotAllowed as error:
-            result = Failure(Problem.NOT_ALLOWED, str(error))
-        except Repeated as error:
-            result = Failure(Problem.UNCLEAR, str(error))
-            refused = Failure(Problem.NOT_ALLOWED, str(error))
         except NotControlled as error:
             result = Failure(Problem.NOT_WRITABLE, str(error))
         except GatewayError as error:
-            result = payload.failure(error)
+            result, refused = payload.failure(error), payload.audited(error)
         finally:
             took = time.monotonic() - started
             value = argument or None

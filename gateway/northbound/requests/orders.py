@@ -5,8 +5,7 @@ import time
 from gateway.contract import payload
 from gateway.contract.interfaces import Parts
 from gateway.contract.keys import Keys
-from gateway.contract.payload import Failure, Problem, WriteOutcome
-from gateway.contract.writers import NotAllowed, Repeated
+from gateway.contract.payload import Failure, WriteOutcome
 from gateway.errors import BadValue, GatewayError
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
@@ -31,11 +30,7 @@ class Orders:
                 raise BadValue(f"{payload.short(key)} has a wildcard: an order names one")
             path = key.removeprefix(self._keys.status(f"{part}/"))
             return await self._parts.keyed(part).order(path, data, by)
-        except (NotAllowed, Repeated) as error:
-            return self._refused(key, Failure(Problem.NOT_ALLOWED, str(error)))
         except GatewayError as error:
-            return self._refused(key, payload.failure(error))
-
-    def _refused(self, key: str, failure: Failure) -> Failure:
-        self._audit(WriteOutcome(key, None, failure, time.time_ns(), 0.0, command=True))
-        return failure
+            failure = payload.audited(error)
+            self._audit(WriteOutcome(key, None, failure, time.time_ns(), 0.0, command=True))
+            return failure
