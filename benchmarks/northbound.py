@@ -42,7 +42,7 @@ from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.session.session_settings import configure
-from gateway.parts.alarms import Alarms
+from gateway.parts.alarms.board import Alarms
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.service.service import GC_THRESHOLDS, THREAD_SWITCH
 from gateway.tags import Sample, Tag, WriteResult, WriteRule, good

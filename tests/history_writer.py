@@ -18,7 +18,7 @@ from typing import Any
 
 import structlog
 
-from gateway.parts.history import Historian
+from gateway.parts.history.historian import Historian
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Publishing, Sample, Tag, good
 from gateway.values import Layout, parse_type

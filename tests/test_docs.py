@@ -22,14 +22,13 @@ from gateway.cli.main import cli
 from gateway.config import (
     Config,
     ConfigErrors,
-    HistoryConfig,
     LineConfig,
-    WebConfig,
     ZenohConfig,
     load,
     schema,
 )
 from gateway.config.commands import TO_ALL, every_command
+from gateway.config.settings.sections import part_sections
 from gateway.config.yaml.file import read_yaml
 from gateway.contract import payload
 from gateway.contract.keys import Keys
@@ -40,7 +39,7 @@ from gateway.line.send_permit import Duty
 from gateway.northbound.group.standby import GroupSettings, Standby
 from gateway.northbound.session.exposures import exposures
 from gateway.parts.certificates.part import certificate_document
-from gateway.parts.history import Historian
+from gateway.parts.history.historian import Historian
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
@@ -394,15 +393,18 @@ def test_the_schema_beside_the_example_is_the_gateways() -> None:
 
 
 def test_every_setting_has_an_effect() -> None:
-    files = [path for path in (ROOT / "gateway").rglob("*.py") if path.parent.name != "config"]
+    rooms = [one for one in (ROOT / "gateway").iterdir() if one.name != "config"]
+    files = [path for room in rooms for path in room.rglob("*.py")]
     code = "".join(path.read_text("utf-8") for path in files)
-    parts = (Config, LineConfig, DeviceSettings, ZenohConfig, HistoryConfig, WebConfig)
+    parts = (Config, LineConfig, DeviceSettings, ZenohConfig)
     unused = {
         field.name
         for part in parts
         for field in dataclasses.fields(part)
         if not re.search(rf"\.{field.name}\b", code)
     }
+    for one in part_sections():
+        unused |= {name for name in one.settings.model_fields if f".{name}" not in code}
     assert unused == set()
 
 

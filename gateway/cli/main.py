@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from gateway import __version__, config
 from gateway.cli.terminal import FAILED, USER_MISTAKE, end
 from gateway.errors import BadValue, ConfigError, GatewayError
+from gateway.parts import registry
 
 # Module and function of each command, in the order of `--help`.
 _COMMANDS = {
@@ -41,6 +42,8 @@ _COMMANDS = {
     "version": "main:version",
     "history": "history.history:cli",
 }
+_COMMANDS = {name: f"gateway.cli.{place}" for name, place in _COMMANDS.items()}
+_COMMANDS |= registry.commands()  # those that stand with their parts
 _MINUS_IS_NO_OPTION = {"write", "control"}  # a value may begin with a minus sign
 _FORM: dict[str, Any] = {
     "no_args_is_help": True,
@@ -63,7 +66,7 @@ class _Loaded(UserDict[str, Any]):
 def _imported(name: str, place: str) -> Any:
     """Returns the command, or the group of commands, for a place in `_COMMANDS`."""
     module, _, function = place.partition(":")
-    found = getattr(import_module(f"gateway.cli.{module}"), function)
+    found = getattr(import_module(module), function)
     alone = typer.Typer(**_FORM)
     if isinstance(found, typer.Typer):
         alone.add_typer(found, name=name)

@@ -7,13 +7,7 @@ if TYPE_CHECKING:
     from gateway.config.json_schema import schema
     from gateway.config.loading import built, expanded_text, load, state_folder
     from gateway.config.messages import ConfigErrors
-    from gateway.config.settings.records import (
-        AlarmsConfig,
-        Config,
-        HistoryConfig,
-        LineConfig,
-        WebConfig,
-    )
+    from gateway.config.settings.records import Config, LineConfig
     from gateway.config.settings.zenoh_records import TlsConfig, ZenohConfig, ZenohMode
     from gateway.config.sheets.tags import SheetUse
 else:
@@ -22,7 +16,7 @@ else:
         "json_schema": ("schema",),
         "loading": ("built", "expanded_text", "load", "state_folder"),
         "messages": ("ConfigErrors",),
-        "settings.records": ("AlarmsConfig", "Config", "HistoryConfig", "LineConfig", "WebConfig"),
+        "settings.records": ("Config", "LineConfig"),
         "sheets.tags": ("SheetUse",),
         "settings.zenoh_records": ("TlsConfig", "ZenohConfig", "ZenohMode"),
     }
@@ -36,13 +30,10 @@ else:
 
 
 __all__ = [
-    "AlarmsConfig",
     "Config",
     "ConfigErrors",
-    "HistoryConfig",
     "LineConfig",
     "TlsConfig",
-    "WebConfig",
     "SheetUse",
     "ZenohConfig",
     "ZenohMode",

@@ -15,12 +15,10 @@ from gateway.config.settings.model import (
     LineSection,
 )
 from gateway.config.settings.records import (
-    AlarmsConfig,
     Config,
-    HistoryConfig,
     LineConfig,
-    WebConfig,
 )
+from gateway.config.settings.sections import Place, file_section, placed
 from gateway.config.settings.session_files import existing_file, with_files
 from gateway.config.settings.validate import (
     driver_of,
@@ -49,11 +47,9 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
-from gateway.tags import AlarmRule
 from gateway.transport.port import ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
-ALARM_FILE = FilePath("alarms.json")
 WRITERS_STATE = FilePath("writers.json")
 
 
@@ -79,7 +75,7 @@ class Builder:
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """Returns the whole file; None, after mistakes, where no part could be made."""
-        top = section(FileSection, data, (), self.mistakes, "the file")
+        top = section(file_section(), data, (), self.mistakes, "the file")
         raw_lines = data.get("lines")
         defaults = self._defaults(data, (), TagDefaults())
         lines = []
@@ -101,7 +97,14 @@ class Builder:
         if top is None:
             return None
         check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
-        self._check_history(top)
+        place = Place(
+            self.mistakes,
+            self.folder,
+            self.state_folder,
+            self._state_file(top),
+            [tag for line in lines for tag in line.tags],
+            self._tags.recorded or self._sheets.recorded,
+        )
         return Config(
             name=top.gateway.name,
             state_file=self._state_file(top),
@@ -112,9 +115,7 @@ class Builder:
             folder=self.state_folder or self.folder,
             writers_state=self._written(WRITERS_STATE) if top.writers else None,
             zenoh=with_files(top.zenoh.record(), self.folder, self.mistakes),
-            history=self._history(top),
-            web=self._web(top),
-            alarms=self._alarms(top, lines),
+            parts=placed(top, place),
             lines=tuple(lines),
             transfers=transfers,
             watch=top.gateway.watch_config,
@@ -265,24 +266,6 @@ class Builder:
                     "with all its devices",
                 )
 
-    def _check_history(self, top: FileSection) -> None:
-        recorded = self._tags.recorded or self._sheets.recorded
-        if recorded is not None and top.history is None:
-            self.mistakes.add(
-                (*recorded, "history"),
-                "the file has no `history:` section: write `history: {path: history.db}` beside "
-                "`lines:`",
-            )
-        state = self._state_file(top)
-        if top.history is None or state is None:
-            return
-        if realpath(self._written(top.history.path)) == realpath(state):
-            self.mistakes.add(
-                ("gateway", "state"),
-                f"history is kept in {top.history.path}: two files are needed, such as "
-                "history.db and state.json",
-            )
-
     def _file(self, name: FilePath | None, path: Path) -> FilePath | None:
         return existing_file(name, self.folder, path, self.mistakes)
 
@@ -296,49 +279,9 @@ class Builder:
             name = STATE_FILE
         return None if name is None else self._written(name)
 
-    def _alarms(self, top: FileSection, lines: list[LineConfig]) -> AlarmsConfig:
-        found = top.alarms
-        path = None if found.path is None else self._written(found.path)
-        if path is None and (self.state_folder is not None or _have_alarms(lines)):
-            path = self._written(ALARM_FILE)
-        return AlarmsConfig(
-            path=path, devices=found.devices, lines=found.lines, transfers=found.transfers
-        )
-
-    def _web(self, top: FileSection) -> WebConfig | None:
-        if top.web is None:
-            return None
-        (host, port), place = top.web.listen, ("web", "tokens_file")
-        web = WebConfig(
-            host=host,
-            port=port,
-            tokens_file=self._file(top.web.tokens_file, place),
-            names=tuple(top.web.names),
-        )
-        if web.tokens_file is None and not web.is_local:
-            self.mistakes.add(
-                ("web", "listen"),
-                f"other machines can reach {host}: name a tokens_file too (see docs/page.md), or "
-                f"listen on 127.0.0.1:{port}",
-            )
-        return web
-
-    def _history(self, top: FileSection) -> HistoryConfig | None:
-        if top.history is None:
-            return None
-        return HistoryConfig(
-            path=self._written(top.history.path),
-            keep=top.history.keep,
-            max_size=top.history.max_size,
-        )
-
 
 def _devices_of(raw: object) -> object:
     return raw.get("devices") if isinstance(raw, dict) else None
-
-
-def _have_alarms(lines: list[LineConfig]) -> bool:
-    return any(tag.feature(AlarmRule) is not None for line in lines for tag in line.tags)
 
 
 def _either(own: float | None, default: float) -> float:

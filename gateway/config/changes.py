@@ -16,8 +16,6 @@ _DERIVED = {"folder", "writers_state"}  # from the place of the file, and from `
 _HARMLESS = {"every", "description", "deadband", "publish", "heartbeat", "history"}
 _HARMLESS |= {"payload", "write"}
 _NAMES = {
-    "host": "listen",
-    "port": "listen",
     "name": "gateway.name",
     "state_file": "gateway.state",
     "standby": "gateway.standby",
@@ -133,11 +131,24 @@ def _changed(old: Any, new: Any, prefix: str, left_out: set[str]) -> Iterator[st
         before, after = getattr(old, one.name), getattr(new, one.name)
         if one.name in left_out or before == after or not one.init:
             continue
+        if one.name == "parts":
+            yield from _of_parts(before, after)
+            continue
         name = prefix + _NAMES.get(one.name, one.name)
         if is_dataclass(before) and is_dataclass(after):
             yield from _changed(before, after, f"{name}.", set())
         else:
             yield name
+
+
+def _of_parts(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yields the settings of parts that changed."""
+    for name in dict.fromkeys((*old, *new)):
+        before, after = dict(old.get(name, ())), dict(new.get(name, ()))
+        if not (before and after):
+            yield name
+            continue
+        yield from (f"{name}.{one}" for one in after if before[one] != after[one])
 
 
 def compare(old: Config, new: Config) -> Difference:

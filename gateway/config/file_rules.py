@@ -4,53 +4,36 @@ from collections.abc import Iterator
 from pathlib import Path as FilePath
 
 from gateway import files
-from gateway.config.messages import Mistakes, Path
+from gateway.config.messages import Mistakes
 from gateway.config.settings.records import Config
+from gateway.config.settings.sections import Written, reads, writes
 
-_HISTORY = ("", "-wal", "-shm", "-journal", ".lock")  # SQLite's files, and the lock
 _STATE = ("", ".new", ".bad")
 
 
 def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
     """`own`: the configuration file."""
-    for path, file, tails in _written(config):
-        others = [*_read(config, own)]
-        if path == ("gateway", "state") and config.history is not None:
-            others += [
-                ("a file of the history", FilePath(f"{config.history.path}{tail}"))
-                for tail in _HISTORY[1:]
-            ]
-        if path == ("alarms", "path"):
-            others += [
-                (f"a file of {named[0]}.{named[1]}", FilePath(f"{written}{tail}"))
-                for named, written, its in _written(config)
-                if named != path
-                for tail in its
-            ]
-        for what, other in others:
-            if any(files.are_same(FilePath(f"{file}{tail}"), other) for tail in tails):
+    earlier: list[tuple[str, FilePath]] = []
+    for one in written(config):
+        for what, other in (*_read(config, own), *earlier):
+            if not mistakes.has(one.setting) and any(
+                files.are_same(FilePath(f"{one.file}{tail}"), other) for tail in one.tails
+            ):
                 mistakes.add(
-                    path, f"{file.name} is {what}: name another file, such as {_MEANT[path]}"
+                    one.setting,
+                    f"{one.file.name} is {what}: name another file, such as {one.example}",
                 )
+        what = f"a file of {'.'.join(map(str, one.setting))}"
+        earlier += [(what, FilePath(f"{one.file}{tail}")) for tail in one.tails]
 
 
-_MEANT: dict[Path, str] = {
-    ("history", "path"): "history.db",
-    ("gateway", "state"): "state.json",
-    ("alarms", "path"): "alarms.json",
-    ("writers", "file"): "writers.txt",
-}
-
-
-def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]:
-    if config.history is not None:
-        yield ("history", "path"), config.history.path, _HISTORY
+def written(config: Config) -> Iterator[Written]:
+    """Yields the files that the gateway writes."""
+    yield from writes(config.parts)
     if config.state_file is not None:
-        yield ("gateway", "state"), config.state_file, _STATE
-    if config.alarms.path is not None:
-        yield ("alarms", "path"), config.alarms.path, _STATE
+        yield Written(("gateway", "state"), config.state_file, _STATE, "state.json")
     if config.writers_state is not None:
-        yield ("writers", "file"), config.writers_state, _STATE
+        yield Written(("writers", "file"), config.writers_state, _STATE, "writers.txt")
 
 
 def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
@@ -62,7 +45,7 @@ def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
         "zenoh.users_file": zenoh.users_file,
         "writers.file": config.writers_file,
         "gateway.secret_file": config.secret_file,
-        "web.tokens_file": None if config.web is None else config.web.tokens_file,
+        **dict(reads(config.parts)),
     }
     if tls is not None:
         read |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}

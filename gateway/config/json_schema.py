@@ -9,12 +9,9 @@ from typing import Any, get_type_hints
 from pydantic import BaseModel, TypeAdapter
 
 from gateway.config.settings.driver_settings import dataclasses_in, is_duration
-from gateway.config.settings.model import (
-    DeviceSection,
-    FileSection,
-    LineSection,
-)
+from gateway.config.settings.model import DeviceSection, LineSection
 from gateway.config.settings.parsers import BYTES, SECONDS
+from gateway.config.settings.sections import file_section
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import (
     DURATION_SCHEMA,
@@ -61,7 +58,7 @@ _TEMPLATE: dict[str, Any] = {
 
 def schema() -> dict[str, Any]:
     """Returns the schema. A device has one shape per protocol, each with the common settings."""
-    root = _described(FileSection)
+    root = _described(file_section())
     shared: dict[str, Any] = root.setdefault("$defs", {})
     for name, part in _PARTS.items():
         shared[name] = _hoisted(_described(part), shared)
@@ -125,7 +122,7 @@ def _texts(kind: type[BaseModel]) -> dict[str, str]:
     """Returns the texts below the fields, by the name in the file."""
     found: dict[str, str] = {}
     for one in reversed(kind.__mro__):
-        if not issubclass(one, BaseModel) or one is BaseModel:
+        if not issubclass(one, BaseModel) or one in (BaseModel, file_section()):
             continue
         [tree] = ast.parse(inspect.getsource(one)).body
         body = tree.body if isinstance(tree, ast.ClassDef) else []

@@ -85,6 +85,10 @@ class Mistakes:
         """Adds the mistakes of another file, after those of this one."""
         self._others.append(other)
 
+    def has(self, path: Path) -> bool:
+        """Returns True if the setting has a mistake already."""
+        return any(mistake.path == path for mistake in self._found)
+
     def sentences(self) -> list[str]:
         """Returns the mistakes without their places."""
         return [mistake.what for mistake in self._found]

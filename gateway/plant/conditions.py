@@ -3,7 +3,7 @@
 Parts add theirs; the alarms judge them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import NamedTuple
 
 from gateway.tags import AlarmRule
@@ -35,5 +35,7 @@ class Conditions:
         self._by_owner[owner] = conditions
         self.version += 1
 
-    def all(self) -> dict[str, Condition]:
-        return {key: one for found in self._by_owner.values() for key, one in found.items()}
+    def all(self, without: Container[str] = ()) -> dict[str, Condition]:
+        """`without`: owners whose conditions are left out."""
+        wanted = (found for owner, found in self._by_owner.items() if owner not in without)
+        return {key: one for found in wanted for key, one in found.items()}

@@ -13,8 +13,9 @@ from structlog.testing import capture_logs
 from gateway.config import load
 from gateway.contract.faults import faults
 from gateway.errors import Busy
-from gateway.parts.alarms import Alarms, Entry, Event, State
+from gateway.parts.alarms.board import Alarms, Entry
 from gateway.parts.alarms.file import AlarmFile, parse
+from gateway.parts.alarms.machine import Event, State
 from gateway.parts.alarms.part import AlarmPart
 from gateway.plant.conditions import Condition, Reading
 from gateway.plant.plant import Plant

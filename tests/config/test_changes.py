@@ -104,5 +104,5 @@ def test_a_line_with_another_speed_is_opened_again() -> None:
 def test_settings_of_the_process_need_a_restart() -> None:
     old = built(data())
     zenoh = replace(old.zenoh, listen=("tcp/127.0.0.1:7448",), prefix="other")
-    new = replace(old, name="other", zenoh=zenoh, history=None, watch=True)
+    new = replace(old, name="other", zenoh=zenoh, parts={"alarms": old.parts["alarms"]}, watch=True)
     assert needs_restart(old, new) == ["gateway.name", "zenoh.prefix", "zenoh.listen"]

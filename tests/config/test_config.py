@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 
 from gateway.config import Config, ConfigErrors, load, schema
 from gateway.config.settings import parsers
-from gateway.config.settings.model import HistorySection, WebSection
 from gateway.config.settings.session_model import Section, ZenohSection
 from gateway.config.tags.section import TagDefaults
 from gateway.config.yaml.file import read_yaml
 from gateway.errors import ConfigError
+from gateway.parts.history.settings import HistorySection
+from gateway.parts.web.settings import WebSection
 from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, Span, Unit
@@ -797,11 +798,12 @@ def test_the_file_of_the_contract(file: Callable[[str], Config], tmp_path: Path)
     assert config.name == "demo"
     assert config.zenoh.prefix == "plant"
     assert config.zenoh.listen == ("tcp/127.0.0.1:7447",)
-    assert config.history is not None
-    assert config.history.keep == 7 * 86400
-    assert config.history.max_size == 10**9
-    assert config.web is not None
-    assert (config.web.host, config.web.port) == ("127.0.0.1", 8080)
+    history, web = config.part(HistorySection), config.part(WebSection)
+    assert history is not None
+    assert history.keep == 7 * 86400
+    assert history.max_size == 10**9
+    assert web is not None
+    assert (web.host, web.port) == ("127.0.0.1", 8080)
 
     hall_1, hall_2 = config.lines
     assert hall_1.port == SerialPath("/dev/ttyUSB0")
@@ -1063,8 +1065,9 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     )
     config = load(plant)
     assert config.zenoh.config_file == tmp_path / "zenoh.json5"
-    assert config.history is not None
-    assert config.history.path == tmp_path / "data" / "h.db"
+    history = config.part(HistorySection)
+    assert history is not None
+    assert history.path == tmp_path / "data" / "h.db"
     assert only_tag(config).publishing.history
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from gateway.config import ConfigErrors, load
+from gateway.parts.history.settings import HistorySection
 from tests.e2e.processes import vigor_line, write_config
 
 LINES = {"hall": vigor_line("simulator", {"t": {"address": "D1"}})}
@@ -17,8 +18,9 @@ def test_without_a_state_directory_files_are_beside_the_configuration(
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     file = write_config(tmp_path / "c.yaml", ENDPOINT, LINES, history={})
     config = load(file)
-    assert config.history is not None
-    assert config.history.path == tmp_path / "history.db"
+    history = config.part(HistorySection)
+    assert history is not None
+    assert history.path == tmp_path / "history.db"
     assert config.state_file is None
 
 
@@ -31,8 +33,9 @@ def test_with_one_relative_paths_are_below_it_and_there_is_a_state_file(
     gateway = {"name": "demo", "secret_file": "secret.txt"}
     file = write_config(tmp_path / "c.yaml", ENDPOINT, LINES, history={}, gateway=gateway)
     config = load(file)
-    assert config.history is not None
-    assert config.history.path == Path("/var/lib/plc/history.db")
+    history = config.part(HistorySection)
+    assert history is not None
+    assert history.path == Path("/var/lib/plc/history.db")
     assert config.state_file == Path("/var/lib/plc/state.json")
     assert config.secret_file == tmp_path / "secret.txt"
 
@@ -41,8 +44,9 @@ def test_absolute_paths_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/plc")
     own = {"gateway": {"state": "/srv/s.json"}, "history": {"path": "/srv/h.db"}}
     config = load(write_config(tmp_path / "c.yaml", ENDPOINT, LINES, **own))
-    assert config.history is not None
-    assert (config.history.path, config.state_file) == (Path("/srv/h.db"), Path("/srv/s.json"))
+    history = config.part(HistorySection)
+    assert history is not None
+    assert (history.path, config.state_file) == (Path("/srv/h.db"), Path("/srv/s.json"))
 
 
 def test_the_history_is_not_the_state_file_that_nobody_named(

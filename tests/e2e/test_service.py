@@ -14,7 +14,7 @@ import pytest
 
 from gateway.config import load
 from gateway.northbound.requests.inbox import Inbox
-from gateway.parts.history import Historian
+from gateway.parts.history.historian import Historian
 from gateway.parts.history.part import HistoryPart
 from gateway.plant.part import Phase
 from gateway.plant.plant import Plant

@@ -12,8 +12,8 @@ from typing import Any
 
 from gateway.contract import payload
 from gateway.contract.payload import WriteOutcome
-from gateway.parts.history import Historian
 from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.historian import Historian
 from gateway.parts.history.recent import SortedRun
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value

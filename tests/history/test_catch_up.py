@@ -20,7 +20,7 @@ from gateway.contract.question import Question
 from gateway.engine.jobs.requests import CommandResult
 from gateway.northbound.answering.answers import HISTORY_LIMIT
 from gateway.northbound.northbound import Northbound
-from gateway.parts.history import Historian
+from gateway.parts.history.historian import Historian
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from gateway.tags.recorded import Recorded, RecordedQuery
 from tests.e2e.processes import Program

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.contract.timerange import EARLIEST, LATEST
+from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import Busy, Damaged
-from gateway.parts.history import TimeRange
 from gateway.parts.history.file import HistoryFile
 from gateway.parts.history.reader import Reader
 from gateway.parts.history.recent import Recent

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from gateway.errors import BadValue, Busy
-from gateway.parts.history import Historian
+from gateway.parts.history.historian import Historian
 from gateway.parts.history.reader import Reader
 from gateway.parts.history.recent import Recent
 from gateway.parts.history.rows import Row

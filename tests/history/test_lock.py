@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy
-from gateway.parts.history import Historian, lock
+from gateway.parts.history import lock
+from gateway.parts.history.historian import Historian
 from tests.history.recorded import (
     EVERYTHING,
     SMALL,

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.timerange import EARLIEST, LATEST
+from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import Busy
-from gateway.parts.history import TimeRange
 from gateway.parts.history.file import HistoryFile
 from gateway.parts.history.outcomes import Outcome, Ring
 from gateway.parts.history.reader import Part, Reader, in_order

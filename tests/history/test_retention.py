@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from gateway.contract.payload import WriteOutcome
+from gateway.contract.timerange import time_range
 from gateway.errors import Busy
-from gateway.parts.history import Historian, time_range
+from gateway.parts.history.historian import Historian
 from gateway.parts.history.outcomes import MOST_WAITING
 from gateway.parts.history.recent import MOST_RUNS, SortedRun
 from gateway.parts.history.retention import age

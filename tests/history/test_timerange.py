@@ -4,9 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.timerange import EARLIEST, LATEST
+from gateway.contract.timerange import EARLIEST, LATEST, TimeRange, time_range
 from gateway.errors import BadValue
-from gateway.parts.history import TimeRange, time_range
 from tests.history.recorded import NOON, SECOND
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy
-from gateway.parts.history import Historian
 from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.historian import Historian
 from tests.e2e.processes import slowed
 from tests.history.recorded import (
     EVERYTHING,

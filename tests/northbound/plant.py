@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Literal
 
-from gateway.config import AlarmsConfig, ZenohConfig
+from gateway.config import ZenohConfig
 from gateway.contract.interfaces import History
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError, NotSent
@@ -16,6 +16,7 @@ from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
 from gateway.parts.alarms.part import AlarmPart
+from gateway.parts.alarms.settings import AlarmsSection
 from gateway.plant.conditions import Conditions
 from gateway.plant.part import Core
 from gateway.protocols.driver import Address, Span, Unit
@@ -81,7 +82,7 @@ class PlainPlant:
 
     @property
     def config(self) -> Any:
-        return SimpleNamespace(alarms=AlarmsConfig())
+        return SimpleNamespace(part=lambda _kind: AlarmsSection())
 
     def wire_logs(self) -> Mapping[str, WireLog]:
         return {"hall": self.hall}

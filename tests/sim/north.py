@@ -22,6 +22,7 @@ import structlog
 import zenoh
 
 from gateway.config import Config, LineConfig, load
+from gateway.parts.history.settings import HistorySection
 from gateway.simulator.port import open_simulator
 from gateway.tags import Sample, Tag
 from tests.sim.north_clients import Person
@@ -52,7 +53,7 @@ class World:
         self.drawn, self.story, self.seconds, self.turns = drawn, story, seconds, turns
         self.net = Net(turns)
         self.slaves: dict[str, Slave] = {}
-        history = config.history
+        history = config.part(HistorySection)
         assert history is not None
         self.judge = Judge(story, turns.loop.time(), drawn.refresh, history.keep)
         turns.loop.set_exception_handler(self._crashed)

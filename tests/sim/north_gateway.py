@@ -7,7 +7,8 @@ from typing import Any
 from gateway.config import Config, LineConfig
 from gateway.contract.interfaces import History, NoParts
 from gateway.northbound.northbound import Northbound
-from gateway.parts.history import Historian
+from gateway.parts.history.historian import Historian
+from gateway.parts.history.settings import HistorySection
 from gateway.plant.plant import Plant
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample
@@ -38,7 +39,7 @@ class Process:
     ) -> None:
         self.judge = judge
         self.gateway = Plant(config, wall, opener)
-        history = config.history
+        history = config.part(HistorySection)
         assert history is not None
         self.history = Historian(history.path, history.keep, history.max_size, wall)
         self.northbound = Northbound(config.zenoh, "sim", self.gateway, parts=Kept(self.history))

@@ -15,7 +15,8 @@ from gateway.config import LineConfig, built
 from gateway.contract.keys import Keys
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
-from gateway.parts.alarms import Alarms, State
+from gateway.parts.alarms.board import Alarms
+from gateway.parts.alarms.machine import State
 from gateway.parts.alarms.part import AlarmPart
 from gateway.parts.transfers import Transfers
 from gateway.plant.build import OpenPort

@@ -6,13 +6,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
-from gateway.config import WebConfig
 from gateway.contract.faults import Documents
 from gateway.contract.interfaces import History
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web import metrics
 from gateway.parts.web.server import Server
+from gateway.parts.web.settings import WebSection
 from gateway.plant.part import Core
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
@@ -165,8 +165,8 @@ class Client:
         return Answer(int(first.split()[1]), found, rest)
 
 
-def local(**settings: Any) -> WebConfig:
-    return WebConfig(**{"host": "127.0.0.1", "port": free_port(), **settings})
+def local(host: str = "127.0.0.1", **settings: Any) -> WebSection:
+    return WebSection.model_construct(listen=(host, free_port()), **settings)
 
 
 def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None) -> Core:
@@ -177,7 +177,7 @@ def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None
 
 @asynccontextmanager
 async def serving(**settings: Any) -> AsyncIterator[Client]:
-    """Serves at a free port; `settings`: those of `WebConfig`, `history`, `plant`."""
+    """Serves at a free port; `settings`: those of `WebSection`, `history`, `plant`."""
     history, plant = settings.pop("history", None), settings.pop("plant", None) or mixer()
     config, north = local(**settings), PlainNorth()
     server = Server(config, core_of(plant, north, history))

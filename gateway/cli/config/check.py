@@ -14,6 +14,8 @@ from gateway.cli.config.served_plan import served_plan
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
+from gateway.config.file_rules import written
+from gateway.config.messages import dotted
 from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.parts.history.place import trouble
@@ -113,17 +115,12 @@ def _notes(config: Config) -> Iterator[str]:
 
 def _unwritable(config: Config) -> Iterator[str]:
     """Yields a sentence for each file that the gateway could not write."""
-    kept = config.history
     below = "set" if state_folder() else "not set"
-    for setting, file in (
-        ("history.path", None if kept is None else kept.path),
-        ("gateway.state", config.state_file),
-        ("alarms.path", config.alarms.path),
-    ):
-        if file is not None and (why := trouble(file)) is not None:
+    for setting, file, _, _ in written(config):
+        if (why := trouble(file)) is not None:
             yield (
-                f"{setting}: {file} cannot be written: {why}. Check as the user of the service, "
-                f"with its $STATE_DIRECTORY ({below} here)"
+                f"{dotted(setting)}: {file} cannot be written: {why}. Check as the user of the "
+                f"service, with its $STATE_DIRECTORY ({below} here)"
             )
 
 

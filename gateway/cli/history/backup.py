@@ -9,6 +9,7 @@ from gateway.cli.terminal import ConfigPath
 from gateway.config import load
 from gateway.errors import GatewayError
 from gateway.parts.history.backup import backup as copied
+from gateway.parts.history.settings import HistorySection
 
 
 def backup(
@@ -17,7 +18,7 @@ def backup(
 ) -> None:
     """Copy the history to a file. The gateway may run: nothing waits for it."""
     loaded = load(config)
-    if loaded.history is None:
+    if (kept := loaded.part(HistorySection)) is None:
         raise GatewayError(f"{config} has no `history:` section")
-    size = copied(loaded.history.path, copy)
+    size = copied(kept.path, copy)
     print(f"{copy}: {size / 1e6:.1f} MB")

@@ -21,6 +21,7 @@ from gateway.parts.history.course import Course
 from gateway.parts.history.offline import offline
 from gateway.parts.history.salvage import salvage as salvaged
 from gateway.parts.history.search import Search
+from gateway.parts.history.settings import HistorySection
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.tags.recorded import RecordedQuery
 from gateway.tags.sample import has_value
@@ -186,9 +187,9 @@ def _tags(config: Config, names: list[str] | None) -> dict[str, Tag]:
 
 
 def _path(config: Config, file: Path) -> Path:
-    if config.history is None:
+    if (kept := config.part(HistorySection)) is None:
         raise GatewayError(f"{file} has no `history:` section")
-    return config.history.path
+    return kept.path
 
 
 def _nothing() -> None:

@@ -4,7 +4,6 @@ An editor shows the descriptions. Mistakes that need more than one setting (an a
 device does not have, two stations with one number) are found by `gateway.config.build`.
 """
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -21,11 +20,9 @@ from gateway.config.settings.setting_types import (
     Baudrate,
     Duration,
     FilePath,
-    HostName,
     Interval,
     Port,
     Text,
-    WebAddress,
 )
 
 
@@ -34,46 +31,6 @@ class WritersSection(Section):
 
     file: FilePath
     """One line `name:secret` for each client; see docs/security.md."""
-
-
-class HistorySection(Section):
-    """Samples kept on disk, for tags with `history: true`."""
-
-    path: FilePath = Path("history.db")
-    """The SQLite file, relative to $STATE_DIRECTORY, else to this file's folder."""
-    keep: Interval = 7 * 86400.0
-    """Older samples are deleted."""
-    max_size: Annotated[
-        int,
-        PlainValidator(parsers.size),
-        WithJsonSchema({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"}),
-    ] = 10**9
-    """The oldest samples are deleted when the file grows beyond this size."""
-
-
-class AlarmsSection(Section):
-    """The alarms of the gateway."""
-
-    path: FilePath | None = None
-    """Keeps alarms across restarts; left out: alarms.json in $STATE_DIRECTORY, or beside this file
-    if a tag has an alarm."""
-    devices: bool = True
-    """A device that does not reply is an alarm."""
-    lines: bool = True
-    """A line that is down is an alarm."""
-    transfers: bool = True
-    """A transfer that does not work is an alarm."""
-
-
-class WebSection(Section):
-    """The status page and /metrics."""
-
-    listen: WebAddress = ("127.0.0.1", 8080)
-    """The address of the page."""
-    tokens_file: FilePath | None = None
-    """One line `name:token` for each client; without it nothing can be written."""
-    names: list[HostName] = []
-    """Names of this machine in a browser's address, besides `localhost` and its host name."""
 
 
 class DeviceSection(Section):
@@ -144,9 +101,6 @@ class FileSection(Section):
     gateway: GatewaySection = GatewaySection()
     zenoh: ZenohSection = ZenohSection()
     writers: WritersSection | None = None
-    history: HistorySection | None = None
-    web: WebSection | None = None
-    alarms: AlarmsSection = AlarmsSection()
     templates: dict[str, Any] = {}
     """Devices with parameters, which devices `use`: docs/templates.md."""
     templates_from: str | list[str] = []

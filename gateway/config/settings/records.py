@@ -2,8 +2,8 @@
 
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
-from ipaddress import ip_address
 from pathlib import Path
+from typing import Any, TypeVar
 
 from gateway.config.settings.zenoh_records import ZenohConfig
 from gateway.config.sheets.tags import SheetUse
@@ -14,42 +14,7 @@ from gateway.tags.transfer import TransferRule
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryConfig:
-    """The store of samples. `keep` in seconds, `max_size` in bytes."""
-
-    path: Path
-    keep: float
-    max_size: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmsConfig:
-    """The file that keeps alarms, and the alarms that need no setting."""
-
-    path: Path | None = None  # None: a restart forgets them
-    devices: bool = True
-    lines: bool = True
-    transfers: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WebConfig:
-    """The address of the status page, and who may use it."""
-
-    host: str
-    port: int
-    tokens_file: Path | None = None  # None: nothing can be written
-    names: tuple[str, ...] = ()  # of this machine, in the address of a browser
-
-    @property
-    def is_local(self) -> bool:
-        """True if other machines cannot reach the address."""
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+P = TypeVar("P")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +43,7 @@ class LineConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """One whole file. `history` and `web` are None where the file has not the section."""
+    """One whole file."""
 
     name: str
     state_file: Path | None = None  # learned properties of the devices, across restarts
@@ -89,13 +54,15 @@ class Config:
     folder: Path | None = None  # of the files that the gateway writes
     writers_state: Path | None = None  # with `writers_file`: what a restart must not accept again
     zenoh: ZenohConfig
-    history: HistoryConfig | None
-    web: WebConfig | None
-    alarms: AlarmsConfig = AlarmsConfig()
+    parts: Mapping[str, Any]  # the settings of parts by section; `part` finds them by their class
     lines: tuple[LineConfig, ...]
     transfers: tuple[TransferRule, ...] = ()
     watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
+
+    def part(self, kind: type[P]) -> P | None:
+        """Returns the settings of a part; None: the file has not its section."""
+        return next((one for one in self.parts.values() if isinstance(one, kind)), None)
 
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:

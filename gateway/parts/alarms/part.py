@@ -16,6 +16,7 @@ from gateway.parts.alarms.board import Alarms, Entry
 from gateway.parts.alarms.documents import alarm_fields, open_alarms, parse_acknowledgement
 from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.alarms.machine import Event, State
+from gateway.parts.alarms.settings import AlarmsSection
 from gateway.parts.alarms.watched import conditions
 from gateway.plant.part import Core, Kind
 from gateway.tags import Sample, Tag
@@ -34,7 +35,8 @@ class AlarmPart:
         self._core = core
         self._plant = core.plant
         self.alarms = Alarms(core.plant.tags(), core.plant.wall)
-        self._file = AlarmFile(core.config.alarms.path, self.alarms)
+        self._settings = core.config.part(AlarmsSection) or AlarmsSection()
+        self._file = AlarmFile(self._settings.path, self.alarms)
         self._version = -1  # of the conditions
         self.alarms.subscribe(self._changed)
 
@@ -57,8 +59,8 @@ class AlarmPart:
     def _watch(self) -> None:
         """Follows the conditions of the plant and of other parts."""
         found = self._plant.conditions
-        found.put("alarms", conditions(self._plant.lines, self._core.config.alarms))
-        self.alarms.watch(found.all())
+        found.put("alarms", conditions(self._plant.lines, self._settings))
+        self.alarms.watch(found.all(without=() if self._settings.transfers else ("transfers",)))
 
     async def take_over(self, config: Config, renewed: Mapping[Tag, Tag]) -> None:
         self._watch()
@@ -80,7 +82,7 @@ class AlarmPart:
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         found: dict[str, Mapping[str, object]] = {"alarms": self.alarms.counts()}
-        if self._core.config.alarms.path is not None:
+        if self._settings.path is not None:
             found["files/alarms"] = {"trouble": self._file.trouble}
         return found
 

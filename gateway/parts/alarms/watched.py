@@ -3,10 +3,10 @@
 from collections.abc import Iterable
 from functools import partial
 
-from gateway.config import AlarmsConfig
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.line.line import Line
+from gateway.parts.alarms.settings import AlarmsSection
 from gateway.plant.conditions import Condition, Reading
 from gateway.tags import AlarmRule, Level
 
@@ -16,7 +16,7 @@ LINE_DELAY = 3.0
 LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
 
 
-def conditions(lines: Iterable[Line], config: AlarmsConfig) -> dict[str, Condition]:
+def conditions(lines: Iterable[Line], config: AlarmsSection) -> dict[str, Condition]:
     """Returns the conditions of lines and of their devices, by the key of their alarm."""
     found = {}
     for line in lines:

@@ -7,6 +7,7 @@ import structlog
 
 from gateway.contract.interfaces import History
 from gateway.parts.history.historian import Historian
+from gateway.parts.history.settings import HistorySection
 from gateway.plant.part import Core, Kind, Part, Phase, Remembers
 from gateway.plant.plant import Plant
 from gateway.plant.threads import off_loop
@@ -49,7 +50,7 @@ class HistoryPart:
 
 
 def _make(core: Core) -> Part | None:
-    kept = core.config.history
+    kept = core.config.part(HistorySection)
     if kept is None:
         return None
     return HistoryPart(core.plant, Historian(kept.path, kept.keep, kept.max_size))

@@ -15,10 +15,7 @@ class TransferPart:
     """The rows of the file."""
 
     def __init__(self, core: Core) -> None:
-        config = core.config
-        self._rows = rows = Transfers(
-            core.plant, core.north.write_own, config.transfers, alarms=config.alarms.transfers
-        )
+        self._rows = rows = Transfers(core.plant, core.north.write_own, core.config.transfers)
         core.plant.adjust_forecasts(with_writes)
         self.publish, self.set_online = rows.publish, rows.set_online
         self.documents = rows.documents

@@ -84,19 +84,10 @@ class _Running:
 class Transfers:
     """The rows of the file, a `Subscriber` of the gateway. Belongs to the event loop."""
 
-    def __init__(
-        self,
-        plant: Plant,
-        write: Write,
-        rules: Sequence[TransferRule],
-        *,
-        alarms: bool = True,
-    ) -> None:
-        """`alarms`: a row that does not work is an alarm."""
+    def __init__(self, plant: Plant, write: Write, rules: Sequence[TransferRule]) -> None:
         self._plant = plant
         self._write = write
         self._rules = rules
-        self._alarms = alarms
         self._running: list[_Running] = []
         self._by_source: dict[Tag, list[_Running]] = {}
         self._ending: set[asyncio.Task[None]] = set()
@@ -156,7 +147,7 @@ class Transfers:
     def _watch(self) -> None:
         """Has one alarm for each row."""
         wanted = {}
-        for one in self._running if self._alarms else ():
+        for one in self._running:
             source, target = one.rule.text
             text = f"{one.name} from {source} to {target} does not work"
             rule = AlarmRule({Level.STOPPED: True}, delay=ALARM_DELAY, text=text)

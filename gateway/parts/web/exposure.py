@@ -2,11 +2,12 @@
 
 from gateway.config import Config
 from gateway.contract.named_secrets import NamedSecrets
+from gateway.parts.web.settings import WebSection
 
 
 def check(config: Config) -> list[str]:
     """Returns warnings, as sentences. Raises `ConfigError` for a bad tokens file."""
-    web = config.web
+    web = config.part(WebSection)
     if web is None:
         return []
     if web.tokens_file is not None:

@@ -14,11 +14,11 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
-from gateway.config import WebConfig
 from gateway.contract.named_secrets import NamedSecrets
 from gateway.parts.web.connections import Connections, client_of
 from gateway.parts.web.places import Places
 from gateway.parts.web.replies import answer, send
+from gateway.parts.web.settings import WebSection
 
 BY = web.RequestKey("by", str)  # the name of the token; empty without a valid one
 MOST_OPEN = 64  # requests at once, and of one client; beyond, 503
@@ -40,7 +40,7 @@ _HEADERS = {
 class Guard:
     """The middleware before every handler. Raises `ConfigError` for a bad tokens file."""
 
-    def __init__(self, config: WebConfig, connections: Connections) -> None:
+    def __init__(self, config: WebSection, connections: Connections) -> None:
         self._tokens = None
         if config.tokens_file is not None:
             self._tokens = NamedSecrets(config.tokens_file, "web.tokens_file")

@@ -14,7 +14,6 @@ import structlog
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from gateway.config import WebConfig
 from gateway.parts.web import assets, metrics, openapi
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
@@ -22,6 +21,7 @@ from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events, Loads
 from gateway.parts.web.guard import Guard, add_headers
 from gateway.parts.web.routes import Route
+from gateway.parts.web.settings import WebSection
 from gateway.plant.part import Core, Routed
 from gateway.plant.threads import off_loop
 
@@ -50,7 +50,7 @@ _FAULTS.addFilter(_is_fault_of_ours)
 class Server:
     """The HTTP side of one gateway. Raises `ConfigError` for a bad tokens file."""
 
-    def __init__(self, config: WebConfig, core: Core) -> None:
+    def __init__(self, config: WebSection, core: Core) -> None:
         self._config = config
         self._core = core
         self._api = Api(core)
@@ -61,7 +61,11 @@ class Server:
         routes = [
             *self._api.routes(),
             *AlarmApi(core).routes(),
-            *(route for part in core.others.each(Routed) for route in part.routes()),
+            *(
+                Route(path=one.path, handler=one.handler, method=one.method.lower())
+                for part in core.others.each(Routed)
+                for one in part.routes()
+            ),
             *events.routes(),
             *self._probes(),
             *assets.routes(),

@@ -1,0 +1,55 @@
+"""The section `web` of the file."""
+
+from ipaddress import ip_address
+from pathlib import Path
+
+from gateway.config.settings.sections import PartSection, Place
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import FilePath, HostName, WebAddress
+
+
+class WebSection(Section):
+    """The status page and /metrics."""
+
+    listen: WebAddress = ("127.0.0.1", 8080)
+    """The address of the page."""
+    tokens_file: FilePath | None = None
+    """One line `name:token` for each client; without it nothing can be written."""
+    names: list[HostName] = []
+    """Names of this machine in a browser's address, besides `localhost` and its host name."""
+
+    @property
+    def host(self) -> str:
+        return self.listen[0]
+
+    @property
+    def port(self) -> int:
+        return self.listen[1]
+
+    @property
+    def is_local(self) -> bool:
+        """True if other machines cannot reach the address."""
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def _place(settings: WebSection | None, place: Place) -> WebSection | None:
+    if settings is None:
+        return None
+    if settings.tokens_file is None and not settings.is_local:
+        place.mistakes.add(
+            ("web", "listen"),
+            f"other machines can reach {settings.host}: name a tokens_file too (see docs/page.md), "
+            f"or listen on 127.0.0.1:{settings.port}",
+        )
+    tokens = place.existing(settings.tokens_file, "web", "tokens_file")
+    return settings.model_copy(update={"tokens_file": tokens})
+
+
+def _reads(settings: WebSection) -> list[tuple[str, Path | None]]:
+    return [("web.tokens_file", settings.tokens_file)]
+
+
+SECTION = PartSection(name="web", settings=WebSection, place=_place, reads=_reads)

@@ -1,0 +1,1 @@
+"""A toy part: it greets. Only the list of parts names it."""
