@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -96,10 +97,17 @@ class Running:
                 pass  # a slow machine may refuse one: it stood still
         assert not self.program.has_said("THE LOOP IS HELD")
 
+    async def document(self, path: str) -> dict[str, Any]:
+        async with asyncio.timeout(PATIENCE):
+            while True:  # a slow machine may refuse a query: it stood still
+                for reply in await self.client.get(f"{OWN}/{path}", timeout=PATIENCE):
+                    if reply.ok:
+                        found: dict[str, Any] = reply.json
+                        return found
+
     async def why(self, name: str) -> str:
         """Returns why the part does not work; empty: it does."""
-        [reply] = await self.client.get(f"{OWN}/parts/{name}", timeout=PATIENCE)
-        return str(reply.json["why"])
+        return str((await self.document(f"parts/{name}"))["why"])
 
     async def until_said(self, name: str, why: str) -> None:
         """Waits until the status says why the part does not work; empty: it does."""
@@ -124,8 +132,7 @@ class Running:
             await asyncio.sleep(POLLED)
 
     async def reloads(self) -> int:
-        [reply] = await self.client.get(f"{OWN}/reload", timeout=PATIENCE)
-        return int(reply.json["reloads"])
+        return int((await self.document("reload"))["reloads"])
 
 
 # By part: the points of its life that a running gateway reaches. A reload calls the last three.
