@@ -35,6 +35,7 @@ _COMMANDS = {
     "status": "status:status",
     "health": "status:health",
     "alarms": "alarms:alarms",
+    "audit": "audit:audit",
     "trace": "trace:trace",
     "replay": "line.replay:replay",
     "backup": "history.backup:backup",

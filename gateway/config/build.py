@@ -50,6 +50,7 @@ from gateway.protocols.registry import PROTOCOLS
 from gateway.transport.port import ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
+AUDIT_FILE = FilePath("audit.jsonl")
 WRITERS_STATE = FilePath("writers.json")
 
 
@@ -108,6 +109,7 @@ class Builder:
         return Config(
             name=top.gateway.name,
             state_file=self._state_file(top),
+            audit_file=self._audit_file(top),
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
@@ -277,6 +279,12 @@ class Builder:
         name = top.gateway.state
         if name is None and self.state_folder is not None:
             name = STATE_FILE
+        return None if name is None else self._written(name)
+
+    def _audit_file(self, top: FileSection) -> FilePath | None:
+        name = top.gateway.audit
+        if name is None and self.state_folder is not None:
+            name = AUDIT_FILE
         return None if name is None else self._written(name)
 
 

@@ -18,6 +18,7 @@ _HARMLESS |= {"payload", "write"}
 _NAMES = {
     "name": "gateway.name",
     "state_file": "gateway.state",
+    "audit_file": "gateway.audit",
     "standby": "gateway.standby",
     "standby_alone": "gateway.standby_alone",
     "secret_file": "gateway.secret_file",

@@ -9,6 +9,7 @@ from gateway.config.settings.records import Config
 from gateway.config.settings.sections import Written, reads, writes
 
 _STATE = ("", ".new", ".bad")
+_AUDIT = ("", *(f".{number}" for number in range(1, 10)))
 
 
 def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
@@ -32,6 +33,8 @@ def written(config: Config) -> Iterator[Written]:
     yield from writes(config.parts)
     if config.state_file is not None:
         yield Written(("gateway", "state"), config.state_file, _STATE, "state.json")
+    if config.audit_file is not None:
+        yield Written(("gateway", "audit"), config.audit_file, _AUDIT, "audit.jsonl")
     if config.writers_state is not None:
         yield Written(("writers", "file"), config.writers_state, _STATE, "writers.txt")
 

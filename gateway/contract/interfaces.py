@@ -166,6 +166,9 @@ class Parts(Protocol):
     def history(self) -> History | None:
         """Returns the history; None: none is kept. Raises `Busy` while it does not work."""
 
+    def audit(self, at: int, event: str) -> None:
+        """Has the audit keep an outcome, as JSON; `at`: ns since 1970. Never blocks."""
+
     async def publish_all(self) -> None:
         """Publishes what subscribers of the parts may have missed."""
 
@@ -181,6 +184,9 @@ class NoParts:
 
     def history(self) -> History | None:
         return None
+
+    def audit(self, at: int, event: str) -> None:
+        """Keeps nothing."""
 
     async def publish_all(self) -> None:
         """Publishes nothing."""

@@ -325,6 +325,7 @@ class Northbound:
         session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
     def _record(self, time: int, outcome: str, *, refused: bool) -> None:
+        self._parts.audit(time, outcome)
         with suppress(Busy):  # a stopped history is a fault already
             if (history := self._parts.history()) is not None:
                 history.record_write(time, outcome, refused=refused)

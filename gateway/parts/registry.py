@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gateway.config.settings.sections import PartSection
     from gateway.plant.part import Kind
 
-PARTS = ("history", "state", "serving", "transfers", "alarms", "certificates", "web")
+PARTS = ("history", "audit", "state", "serving", "transfers", "alarms", "certificates", "web")
 
 
 def kinds() -> "list[tuple[str, Kind]]":

@@ -102,6 +102,14 @@ class Remembers(Protocol):
 
 
 @runtime_checkable
+class Audits(Protocol):
+    """Keeps who wrote, commanded and acknowledged what."""
+
+    def audit(self, at: int, event: str) -> None:
+        """Keeps an outcome or an acknowledgement, as JSON; `at`: ns since 1970. Never blocks."""
+
+
+@runtime_checkable
 class Stores(Protocol):
     """Keeps values that clients write and no device has, as `plant.write_path.Store`."""
 

@@ -16,6 +16,7 @@ from gateway.contract.interfaces import History, Keyed, North
 from gateway.errors import Busy, GatewayError
 from gateway.plant.part import (
     Activates,
+    Audits,
     Begins,
     Core,
     Documented,
@@ -227,6 +228,12 @@ class Bulkheads:
                 found: Remembers = one.working(Remembers)
                 return found.history
         return None
+
+    def audit(self, at: int, event: str) -> None:
+        for one in self._all:
+            if isinstance(one.part, Audits):
+                with one:
+                    one.part.audit(at, event)
 
     async def publish_all(self) -> None:
         for one in self._all:

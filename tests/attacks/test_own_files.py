@@ -16,9 +16,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "history.path: link is zenoh.users_file": {"history": {"path": "link"}},
     "history.path: users is zenoh.users_file": {"history": {"path": "users"}},
     "gateway.state: users.txt is zenoh.users_file": {"gateway": {"state": "users.txt"}},
-    "gateway.state: history.db.lock is a file of the history": {
+    "gateway.state: history.db.lock is a file of history.path": {
         "gateway": {"state": "history.db.lock"},
         "history": {},
+    },
+    "gateway.audit: s.json is a file of gateway.state": {
+        "gateway": {"state": "s.json", "audit": "s.json"},
     },
 }
 

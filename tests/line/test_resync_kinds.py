@@ -73,6 +73,8 @@ async def test_a_station_that_answers_tt_gets_no_other_resync_and_another_one_is
 
 def test_the_belief_begins_without_evidence_and_silence_ends_it() -> None:
     kind = ResyncKind()
+    assert all(kind.is_loopback(token) for token in range(0, 20, 2))
+    kind.unanswered(loopback=True)
     assert [kind.is_loopback(token) for token in (0, 2, 4, 6)] == [True, False] * 2
     kind.answered(loopback=True)
     assert all(kind.is_loopback(token) for token in range(0, 20, 2))

@@ -188,6 +188,9 @@ class PlainParts:
     def each(self, capability: type[Any]) -> Sequence[Any]:
         return [self.alarms] if isinstance(self.alarms, capability) else []
 
+    def audit(self, at: int, event: str) -> None:
+        """There is none."""
+
     async def publish_all(self) -> None:
         await self.alarms.publish_all()
 

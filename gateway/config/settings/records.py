@@ -47,6 +47,7 @@ class Config:
 
     name: str
     state_file: Path | None = None  # learned properties of the devices, across restarts
+    audit_file: Path | None = None  # who wrote, commanded and acknowledged what
     standby: str | None = None  # the group of an active and a standby gateway
     standby_alone: float | None = None  # seconds without a link until it becomes active
     secret_file: Path | None = None  # None: claims and tokens are not signed

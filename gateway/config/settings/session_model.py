@@ -35,6 +35,9 @@ class GatewaySection(Section):
     """The chunk of this gateway in the keys."""
     state: FilePath | None = None
     """Keeps refused addresses across restarts; with $STATE_DIRECTORY left out: state.json there."""
+    audit: FilePath | None = None
+    """The audit of writes, commands and acknowledgements; with $STATE_DIRECTORY left out:
+    audit.jsonl there."""
     standby: Group | None = None
     """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None

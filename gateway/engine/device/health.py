@@ -244,7 +244,8 @@ def diagnosis(trouble: GatewayError | None, silent_causes: str) -> str:
         case None:
             return ""
         case Garbled() as error:
-            return f"{_ADVICE.get(error.evidence, 'not understood')} ({error})"
+            found = str(error).partition(": heard")[0]  # the log has the bytes
+            return f"{_ADVICE.get(error.evidence, 'not understood')} ({found})"
         case NoReply():
             return f"{_SILENCE} {silent_causes}".strip()
         case error:

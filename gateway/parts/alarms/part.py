@@ -18,7 +18,7 @@ from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.alarms.machine import Event, State
 from gateway.parts.alarms.settings import AlarmsSection
 from gateway.parts.alarms.watched import conditions
-from gateway.plant.part import Core, Kind
+from gateway.plant.part import Audits, Core, Kind
 from gateway.tags import Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
@@ -97,13 +97,17 @@ class AlarmPart:
         self._publish(entry)
         if event is None:
             return
+        fields = {"event": event.value, **self._fields(entry)}
+        changed = payload.document(fields).decode()
+        if event is Event.ACKNOWLEDGED:
+            for part in self._core.others.each(Audits):
+                part.audit(self._plant.wall(), changed)
         try:
             history = self._core.history()
         except Busy:
             return  # the part that keeps it is a fault already
         if history is not None:
-            fields = {"event": event.value, **self._fields(entry)}
-            history.record_alarm(entry.status.since, payload.document(fields).decode())
+            history.record_alarm(entry.status.since, changed)
 
     def _publish(self, entry: Entry) -> None:
         """The publishing thread makes the document: a line that is lost changes many at once."""

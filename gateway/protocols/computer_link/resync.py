@@ -1,6 +1,7 @@
 """The kinds of resync of a Computer Link station: the loopback TT, or reads of another length.
 
-Some clones are silent about TT. So both are sent in turn, until the station shows which it answers.
+Some clones are silent about TT. So after the first TT without a reply both are sent in turn, until
+the station shows which it answers.
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,9 @@ class ResyncKind:
 
     def is_loopback(self, token: int) -> bool:
         """Returns the kind of the resync with this token: True for TT."""
-        return token // 2 % 2 == 0 if self._loops is None else self._loops
+        if self._loops is None:
+            return self._misses == 0 or token // 2 % 2 == 0
+        return self._loops
 
     def answered(self, *, loopback: bool) -> None:
         """Notes a reply."""
