@@ -58,7 +58,7 @@ class Plant:
             self.folder / "plant.yaml",
             self.endpoint,
             lines,
-            gateway={"name": "demo", "state": "state.json"},
+            gateway={"name": "demo", "state": "state.json", "audit": "audit.jsonl"},
             web={"listen": f"127.0.0.1:{self.port}", "tokens_file": "tokens"},
             history={"path": "history.db"},
             alarms={"path": "alarms.json"},
@@ -139,6 +139,7 @@ class Running:
 RELOADED = {"retag", "take_over"}
 POINTS = {
     "history": ("run", "publish", "documents"),
+    "audit": ("run", "audit", "documents"),
     "state": ("run",),
     "serving": ("run", "seen", "documents"),
     "transfers": ("run", "publish", "documents", "take_over"),
@@ -158,6 +159,8 @@ async def test_each_part_fails_is_said_and_comes_back(tmp_path: Path) -> None:
             for point in points:
                 first = len(plant.program.lines)
                 await plant.tell(f"break {name} {point}")
+                if point == "audit":  # of a write
+                    await plant.client.get(SET, b"7", PATIENCE)
                 if point in RELOADED:
                     await plant.reload()
                 else:
@@ -219,6 +222,7 @@ async def test_each_file_hangs_and_nothing_else_does(tmp_path: Path) -> None:
         "history.db",
         "state.json",
         "alarms.json",
+        "audit.jsonl",
         "hmi",
         "",
     )
