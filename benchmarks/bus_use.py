@@ -205,6 +205,8 @@ async def measure(
     if writes:
         await asyncio.sleep(0.5)  # the line is open by then
         tasks.append(asyncio.create_task(writing(line, device, device.tags[0], took)))
+    while not device.record.exchanges:
+        await asyncio.sleep(0.01)
     await asyncio.sleep(seconds)
     for task in tasks:
         task.cancel()

@@ -88,7 +88,7 @@ def run(lines: int, stations: int, seconds: float) -> tuple[float, float, float,
         for number, plant in enumerate(plants):
             served = [VigorStation(device.driver.station) for device in plant]
             engine = Engine(f"line{number}", plant, WIRE, number)
-            line = Line(engine, opener(served), watching, wall=lambda: 0, seed=number)
+            line = Line(engine, opener(served), watching, wall=lambda: 0)
             tasks.append(asyncio.create_task(line.run()))
         await asyncio.sleep(seconds)
         for task in tasks:

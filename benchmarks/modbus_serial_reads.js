@@ -22,7 +22,7 @@ async function main(way, where, reads) {
         await master.connectRTUBuffered(where, { baudRate: 115200 });
     }
     master.setID(1);
-    master.setTimeout(2000);
+    master.setTimeout(60_000);
     const count = Number(reads);
     let [begun, before] = [0n, null];
     for (let n = -WARM; n < count; n++) {

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import orjson
 
-from gateway.engine.jobs.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import (
     BadValue,
     Busy,
@@ -111,6 +111,10 @@ class GroupResult:
         return Failure(problem, f"{count}: {reasons}" if causes else count, first.code)
 
 
+# The end of any request. `bytes`: the document of an order, as JSON.
+Result = WriteResult | CommandResult | Peeked | Failure | GroupResult | bytes
+
+
 @dataclass(frozen=True, slots=True)
 class WriteOutcome:
     """One write or command with its result, for log, history and the `writes` key.
@@ -190,18 +194,26 @@ def block(samples: Iterable[Sample]) -> bytes:
     return orjson.dumps({sample.tag.name: sample_fields(sample) for sample in samples})
 
 
-def outcome(result: WriteResult | Failure | GroupResult) -> bytes:
-    """The reply to one write or to a group, or the error reply to any query."""
-    if not isinstance(result, GroupResult):
-        return orjson.dumps(_result(result))
-    failed = result.failure
-    whole = {} if failed is None else _result(failed)
-    tags = {short(name): _result(end) for name, end in result.tags.items()}
-    return orjson.dumps({**whole, "tags": tags, "took": round(result.took, 6)})
+def outcome(result: Result) -> bytes:
+    """The reply to a write, a command or a peek, or the error reply to any query."""
+    match result:
+        case bytes():
+            return result
+        case GroupResult(ends, took):
+            failed = result.failure
+            whole = {} if failed is None else _result(failed)
+            tags = {short(name): _result(end) for name, end in ends.items()}
+            return orjson.dumps({**whole, "tags": tags, "took": round(took, 6)})
+        case CommandResult(answer, at, took):
+            return orjson.dumps({"answer": answer, "time": rfc3339(at), "took": round(took, 6)})
+        case Peeked():
+            return orjson.dumps({**result._asdict(), "time": rfc3339(result.time)})
+        case _:
+            return orjson.dumps(_result(result))
 
 
-def failed(result: WriteResult | Failure | GroupResult) -> Failure | None:
-    """Returns the failure of a write, or of a group; None: all was written."""
+def failed(result: Result) -> Failure | None:
+    """Returns the failure of a request, or of a group; None: all was done."""
     if isinstance(result, GroupResult):
         return result.failure
     return result if isinstance(result, Failure) else None

@@ -57,7 +57,6 @@ class Line:
         *,
         echo: bool | None = None,
         wall: Callable[[], int] = time.time_ns,
-        seed: int = 0,
         duty: Duty | None = None,
     ) -> None:
         """`echo`: the port receives its own bytes; None: not known. `wall`: ns since 1970."""
@@ -68,7 +67,6 @@ class Line:
         duty = duty or Duty()
         self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
-        self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self.calls: DialSchedule | None = None  # while a modem is there
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
@@ -197,6 +195,7 @@ class Line:
     async def run(self) -> None:
         """Serves the line until cancelled. Its errors do not end other lines."""
         pause = REOPEN_FIRST
+        chance = random.Random(self.engine.name)  # noqa: S311  (jitter, not a secret)
         while True:
             served, answered = 0.0, False
             try:
@@ -212,7 +211,7 @@ class Line:
                 await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST or answered:
                 pause = REOPEN_FIRST
-            await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
+            await asyncio.sleep(pause * chance.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
 
     async def _open_and_serve(self) -> str:

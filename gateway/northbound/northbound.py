@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import structlog
 import zenoh
@@ -29,7 +30,6 @@ from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming
-from gateway.northbound.requests.writes import OwnWrites
 from gateway.northbound.session import dead_routes, exposures
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.northbound.session.one_process import only_process
@@ -45,6 +45,17 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 STATUS_EVERY = 5.0  # seconds
 _ROUTERS_EVERY = 1.0  # seconds between two lost routers that count
 _FLUSH_TIMEOUT = 0.5  # seconds for waiting puts when the gateway ends
+
+
+class Files(NamedTuple):
+    """Files of one gateway."""
+
+    writers: Path | None = None  # who may write; without it every client that Zenoh admits
+    writers_state: Path | None = None  # until when their signatures were accepted
+    folder: Path | None = None  # of what the gateway writes; only one process runs with it
+
+
+NO_FILES = Files()
 
 
 class Northbound:
@@ -70,27 +81,20 @@ class Northbound:
         plant: Plant,
         *,
         parts: Parts,
-        writers: Path | None = None,
-        writers_state: Path | None = None,
-        folder: Path | None = None,
+        files: Files = NO_FILES,
         group: GroupSettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
-        """`writers` is the file of the clients that may write; without it every client may that
-        Zenoh admits. `writers_state` keeps until when their signatures were accepted. `folder`: of
-        the files that the gateway writes; only one process runs with it.
-        """
         self.keys = Keys(settings.prefix, name)
         self.exclusive = asyncio.Event()
         self.opened = asyncio.Event()
         self._config = configure(settings)
-        self._folder = folder
-        self._is_client = settings.mode is ZenohMode.CLIENT
+        self._folder = files.folder
         group = group or GroupSettings()
-        accepted = None if writers_state is None else AcceptedUntil(writers_state)
+        accepted = None if files.writers_state is None else AcceptedUntil(files.writers_state)
         floor = 0.0 if accepted is None else accepted.floor
-        known_writers = None if writers is None else Writers(writers, floor)
-        for exposure in _exposures(self._config, writers, group):
+        writers = None if files.writers is None else Writers(files.writers, floor)
+        for exposure in _exposures(self._config, files.writers, group):
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
         self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
@@ -110,7 +114,6 @@ class Northbound:
         )
         self._parts = parts
         audit = Audit(partial(self._publisher.document, self.keys.writes), self._record)
-        self.own_writes = OwnWrites(self.keys, plant, audit)
         self._status = StatusPublisher(
             self.keys, self._collect_status, self._publisher, audit, status_every
         )
@@ -121,7 +124,7 @@ class Northbound:
             audit,
             self._status.documents,
             parts,
-            Acceptance(plant.duty, known_writers, accepted=accepted),
+            Acceptance(plant.duty, writers, accepted=accepted),
         )
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
 
@@ -167,7 +170,7 @@ class Northbound:
 
     async def write_own(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
         """Writes for a part named `by`, as `OwnWrites.write`."""
-        return await self.own_writes.write(tag, value, by, within)
+        return await self._incoming.own_writes.write(tag, value, by, within)
 
     @property
     def is_ready(self) -> bool:
@@ -232,11 +235,12 @@ class Northbound:
             await self._run()
 
     async def _run(self) -> None:
-        if self._is_client:
+        is_client = self._config.get_json("mode") == f'"{ZenohMode.CLIENT.value}"'
+        if is_client:
             self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         alone = asyncio.create_task(self._admission.run_alone())
         try:
-            session = await open_session(self._config, retry=self._is_client)
+            session = await open_session(self._config, retry=is_client)
         finally:
             alone.cancel()
         self.exclusive.set()

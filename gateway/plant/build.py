@@ -102,4 +102,4 @@ def line_of(
     opens = open_port or opener(config)
     if config.listen_only:
         opens = _without_writing(opens)
-    return Line(engine, opens, sink, echo=config.echo, wall=wall, seed=seed, duty=duty)
+    return Line(engine, opens, sink, echo=config.echo, wall=wall, duty=duty)

@@ -21,10 +21,10 @@ from gateway.line.line import Line
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.plant.build import OpenPort, line_of, opener
-from gateway.plant.conditions import Conditions
+from gateway.plant.doors import Doors
 from gateway.plant.expected import Adjust, Expected
 from gateway.plant.on_demand import OnDemand
-from gateway.plant.write_path import Store, WritePath
+from gateway.plant.write_path import WritePath
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.timestamps import rfc3339
@@ -48,14 +48,10 @@ class Subscriber(Protocol):
     def set_online(self, device: str, online: bool) -> None: ...
 
 
-Documents = Mapping[str, Document]
-
-
 class Plant:
     """The lines of one configuration, and the last sample of every tag.
 
-    Parts use the doors: `subscribe`, `add_documents`, `seers`, `retagged`, `conditions`, `stores`,
-    `logs`, `adjust_forecasts`.
+    Parts use `subscribe`, `adjust_forecasts` and the `doors`.
     """
 
     def __init__(
@@ -71,27 +67,20 @@ class Plant:
 
         Without `plan_now` each line needs `plan` and `planned` before it runs.
         """
-        self.config, self._devices = config, config.devices
+        self.config = config
         self.duty = duty or Duty()
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.lines: list[Line] = []
         self._wall = wall
         self._started = time.monotonic()  # the wall clock may be set back
         self._subscribers: list[Subscriber] = []
-        self._documents: list[Callable[[], Documents]] = []  # of the parts, in the status
-        # Called with all samples that the mirror has stored, and with tags that came and went.
-        self.seers: Sequence[Callable[[Sequence[Sample]], None]] = ()
-        self.retagged: Callable[[Sequence[Tag], Sequence[Tag]], None] = _ignore
-        self.conditions = Conditions()
-        self.is_restored = False  # what was learned before the start is known
-        self.stores: list[Store] = []
-        self.logs: list[Callable[[], Mapping[str, WireLog]]] = []
+        self.doors = Doors()
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
         self._open_line, self._seeds = open_line, itertools.count()
         self._expected = Expected(lambda: self.config)
         self._on_demand = OnDemand(self._places.get, self.sample)
-        self._requests = WritePath(self._places, self._tags, self.stores, wall)
+        self._requests = WritePath(self._places, self._tags, self.doors.stores, wall)
         for line in config.lines:
             if not line.serve:
                 self.add_line(line)
@@ -161,7 +150,7 @@ class Plant:
             for tag in ended:
                 del self._tags[tag.key]
             self.mirror.forget(left)  # last: other threads find the new tag instead
-            self.retagged([*change.started, *change.renewed.values()], left)
+            self.doors.retagged([*change.started, *change.renewed.values()], left)
             self._see(started)
             last = [bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended]
             self._publish([*started, *last])
@@ -173,13 +162,13 @@ class Plant:
         if not (gone or new):
             return
         now = self._wall()
-        enabled = {device.name for device in self._devices if device.enabled}
+        enabled = {device.name for device in self.config.devices if device.enabled}
         self._tags.update((tag.key, tag) for tag in new)
         first = [
             bad(tag, Reason.STARTING if tag.device in enabled else Reason.DISABLED, now)
             for tag in new
         ]
-        self.retagged(new, gone)
+        self.doors.retagged(new, gone)
         found = self.mirror.compute(first, gone)
         self._see(found)
         ended = [tag for tag in gone if self._tags.get(tag.key) is tag]
@@ -189,7 +178,7 @@ class Plant:
 
     def configure(self, config: Config) -> None:
         """Has this configuration, after its changes are taken over."""
-        self.config, self._devices = config, config.devices
+        self.config = config
 
     def move(self, gone: Iterable[str], line: Line, devices: Iterable[Device] = ()) -> None:
         """Notes the devices that the line has no longer, and those that it has now."""
@@ -204,17 +193,13 @@ class Plant:
     def unsubscribe(self, subscriber: Subscriber) -> None:
         self._subscribers.remove(subscriber)
 
-    def add_documents(self, documents: Callable[[], Documents]) -> None:
-        """Adds documents of a part to the status, by path."""
-        self._documents.append(documents)
-
     def adjust_forecasts(self, adjust: Adjust) -> None:
         """Has the forecasts adjusted for the requests of a part."""
         self._expected.adjust(adjust)
 
     def wire_logs(self) -> Mapping[str, WireLog]:
         polled = {line.engine.name: line.wire_log for line in self.lines}
-        return {name: log for logs in self.logs for name, log in logs().items()} | polled
+        return {name: log for logs in self.doors.logs for name, log in logs().items()} | polled
 
     @property
     def enabled_devices(self) -> Sequence[Device]:
@@ -224,7 +209,7 @@ class Plant:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        for seen in self.seers:
+        for seen in self.doors.seers:
             seen(samples)
         if self._on_demand.arrived:
             self._on_demand.note(samples)
@@ -237,7 +222,7 @@ class Plant:
             self._publish(changed)
 
     def _see(self, samples: Sequence[Sample]) -> None:
-        for seen in self.seers if samples else ():
+        for seen in self.doors.seers if samples else ():
             seen(samples)
 
     def online(self, device: Named, online: bool) -> None:
@@ -251,14 +236,14 @@ class Plant:
     # For the Zenoh side
 
     def devices(self) -> Iterable[DeviceSettings]:
-        return self._devices  # the same object until a reload
+        return self.config.devices  # the same object until a reload
 
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 
     def target(self, key: str) -> Tag | None:
         """Finds a tag that a transfer writes: also one that no client sees."""
-        others = (tag for device in self._devices for tag in device.targets)
+        others = (tag for device in self.config.devices for tag in device.targets)
         return self._tags.get(key) or next((tag for tag in others if tag.key == key), None)
 
     def sample(self, tag: Tag) -> Sample:
@@ -272,7 +257,7 @@ class Plant:
 
     def holds(self, tag: Tag) -> bool:
         """Returns True for a value that clients write and a master reads."""
-        return any(store.holds(tag) for store in self.stores)
+        return any(store.holds(tag) for store in self.doors.stores)
 
     def tags(self) -> Iterable[Tag]:
         return self._tags.values()
@@ -345,14 +330,10 @@ class Plant:
         for name, (line, device) in self._places.items():
             polls = line.engine.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)
-        for found in self._documents:
+        for found in self.doors.documents:
             documents |= found()
         lines = {name: one["open"] for name, one in below("lines/", documents)}
         lines = {one.engine.name: one.engine.is_open for one in self.lines} | lines
         standings = {name: one["standing"] for name, one in below("devices/", documents)}
         documents["status"] = {**documents["status"], "lines": lines, "devices": standings}
         return documents
-
-
-def _ignore(tags: Sequence[Tag], gone: Sequence[Tag]) -> None:
-    """No part follows the tags."""

@@ -192,8 +192,8 @@ class Bulkheads:
         self._all: list[Bulkhead] = []
         self._followers: Sequence[tuple[Bulkhead, Follows]] = ()
         self._active = False
-        plant.retagged = self._retag
-        plant.add_documents(self.documents)
+        plant.doors.retagged = self._retag
+        plant.doors.documents.append(self.documents)
 
     def make(
         self,
@@ -276,8 +276,8 @@ class Bulkheads:
             if isinstance(one.part, Follows):
                 followers.append((one, one.part))
         self._followers = followers
-        self._plant.stores[:] = self.each(Stores)
-        self._plant.logs[:] = [part.wire_logs for part in self.each(Logged)]
+        self._plant.doors.stores[:] = self.each(Stores)
+        self._plant.doors.logs[:] = [part.wire_logs for part in self.each(Logged)]
         for one in self._all:
             one.activate(active=self._active)
         seers = list[Callable[[Sequence[Sample]], None]]()
@@ -286,7 +286,7 @@ class Bulkheads:
                 with one:
                     if one.part.wants:
                         seers.append(_guarded(one, one.part.seen))
-        self._plant.seers = seers
+        self._plant.doors.seers = seers
 
     # -- life --
 

@@ -17,7 +17,7 @@ from gateway.errors import GatewayError
 from gateway.line.arrival import ArrivalClock
 from gateway.line.line import Line
 from gateway.line.send_permit import Duty
-from gateway.northbound.northbound import Northbound, group_settings
+from gateway.northbound.northbound import Files, Northbound, group_settings
 from gateway.parts.registry import kinds
 from gateway.plant.part import Phase
 from gateway.plant.plant import Plant
@@ -108,15 +108,13 @@ async def _serve(
         config.name,
         plant,
         parts=parts,
-        writers=config.writers_file,
-        writers_state=config.writers_state,
-        folder=config.folder,
+        files=Files(config.writers_file, config.writers_state, config.folder),
         group=group_settings(config),
     )
     northbound.withhold(withheld)
     plant.subscribe(northbound)
     plant.subscribe(parts)  # clients may have missed what was published
-    plant.add_documents(lambda: {"clock": clock.document(), "reload": reloader.document()})
+    plant.doors.documents.append(lambda: {"clock": clock.document(), "reload": reloader.document()})
     outdated = asyncio.Event()
 
     def start_over(why: str) -> None:

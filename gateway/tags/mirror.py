@@ -5,11 +5,10 @@ from itertools import compress, count
 from operator import ne
 from typing import Any
 
-from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
+from gateway.tags import Deadband, Publish, Quality, Reason, Sample, Tag, bad
 from gateway.tags.computed import Dependents, computed
 from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
-from gateway.values import Value
 from gateway.values.numerals import are_apart
 
 
@@ -244,23 +243,22 @@ def _same_failure(current: Sample, sample: Sample) -> bool:
 def _is_due(last: Sample | None, sample: Sample) -> bool:
     if last is None or last.quality is not sample.quality or last.reason is not sample.reason:
         return True
-    rule = sample.tag.publishing
+    tag = sample.tag
+    rule = tag.publishing
     if rule.publish is Publish.ALWAYS:
         return True
     if rule.heartbeat is not None and not 0 <= sample.time - last.time < rule.heartbeat * 1e9:
         return True  # also after the clock was set back: the interval is then unknown
-    return _changed(sample.tag, last.value, sample.value)
-
-
-def _changed(tag: Tag, old: Value | None, new: Value | None) -> bool:
-    band = tag.publishing.deadband
+    old, new, band = last.value, sample.value, rule.deadband
     if band is None or old is None or new is None:
         return old != new
-    if isinstance(old, (bool, str, tuple)) or isinstance(new, (bool, str, tuple)):
-        return old != new and (tag.element is None or _one_changed(tag.element, old, new))
+    if tag.element is None:
+        return _moved(band, old, new)
+    return any(_moved(band, *pair) for pair in zip(old, new, strict=True))  # type: ignore[arg-type]
+
+
+def _moved(band: Deadband, old: Any, new: Any) -> bool:
+    """Returns True if a value moved by the deadband; a text or a bit, if it is another one."""
+    if isinstance(old, (bool, str)) or isinstance(new, (bool, str)):
+        return bool(old != new)
     return old != new and are_apart(old, new, band.amount, percent=band.percent)
-
-
-def _one_changed(element: Tag, old: Any, new: Any) -> bool:
-    """Returns True if an element of an array moved by the deadband."""
-    return any(_changed(element, *pair) for pair in zip(old, new, strict=True))

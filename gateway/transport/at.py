@@ -55,7 +55,6 @@ class AtModem:
         self._held = b""  # data that may be the beginning of the modem's own text
         self._commands: list[str] = []  # to be sent before the modem is ready
         self._escapes = 0  # of this hang-up
-        self._gone = False  # the modem reports the end of the carrier
         self._then: Event = Ready()  # the event at the end of the hang-up
         self._heard = 0.0  # the last data of the call
         self._rang = -NEVER
@@ -163,7 +162,7 @@ class AtModem:
                 self.state, self.due = State.ESCAPING, now + settings.guard + ESCAPE_WAIT
             case State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + settings.command_timeout)
-            case _ if self._gone:
+            case State.CARRIER_GONE:
                 self._hung_up(now)
             case _ if self._escapes < MOST_ESCAPES:
                 self._guard(now)
@@ -209,7 +208,7 @@ class AtModem:
                 self._next_command(now)
             case State.ABORTING | State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
-            case State.HANGING_UP:
+            case State.HANGING_UP | State.CARRIER_GONE:
                 self._hung_up(now)
 
     def _take_refusal(self, text: str, now: float) -> None:
@@ -226,8 +225,8 @@ class AtModem:
                 self._rest()
             case State.ABORTING | State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
-            case State.HANGING_UP if text.upper() == "NO CARRIER":  # some modems say no OK after it
-                self._gone, self.due = True, now + 2 * PAUSE
+            case State.HANGING_UP | State.CARRIER_GONE if text.upper() == "NO CARRIER":
+                self.state, self.due = State.CARRIER_GONE, now + 2 * PAUSE
 
     @property
     def _place(self) -> str:
@@ -309,7 +308,7 @@ class AtModem:
 
     def _begin_hang_up(self, then: Event, now: float) -> None:
         """`then` is reported when the modem has hung up."""
-        self._then, self._escapes, self._held, self._gone = then, 0, b"", False
+        self._then, self._escapes, self._held = then, 0, b""
         if self.dtr:
             self._events.append(SetDtr(False))
             self.state, self.due = State.DROPPING, now + DTR_TIME

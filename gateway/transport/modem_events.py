@@ -99,3 +99,4 @@ class State(Enum):
     GUARDING = auto()  # the silence before +++
     ESCAPING = auto()  # +++ was sent
     HANGING_UP = auto()  # ATH was sent
+    CARRIER_GONE = auto()  # the modem reports it; some say no OK after it

@@ -37,7 +37,7 @@ def gateway(folder: Path) -> Plant:
 
 
 def served(of: Plant) -> ServingPart:
-    [store] = of.stores
+    [store] = of.doors.stores
     assert isinstance(store, ServingPart)
     return store
 

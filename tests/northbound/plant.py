@@ -17,7 +17,7 @@ from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
 from gateway.parts.alarms.part import AlarmPart
 from gateway.parts.alarms.settings import AlarmsSection
-from gateway.plant.conditions import Conditions
+from gateway.plant.doors import Doors
 from gateway.plant.part import Core
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
@@ -54,7 +54,7 @@ class PlainPlant:
         self.duty = Duty()
         self._devices = devices
         self._tags = {tag.key: tag for device in devices for tag in device.tags}
-        self.conditions, self.lines = Conditions(), ()
+        self.doors, self.lines = Doors(), ()
         self.parts = PlainParts(self)
         self.alarms = self.parts.alarms.alarms
         self.samples = {

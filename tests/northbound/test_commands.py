@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 import pytest
-import zenoh
 from structlog.testing import capture_logs
 
 from gateway.config.commands import NotControlled
@@ -42,10 +41,6 @@ def test_keys_of_commands(key: str, family: Family) -> None:
     assert parse_key(key).family is family
 
 
-def no_stamp() -> zenoh.Timestamp:
-    raise NotImplementedError
-
-
 def execute(
     plant: PlainPlant, key: str, data: bytes | None = None
 ) -> tuple[CommandResult | Failure, Documents]:
@@ -53,7 +48,7 @@ def execute(
     recorded: list[str] = []
     with capture_logs() as logs:
         audit = Audit(published.append, lambda _, text, *, refused: recorded.append(text))
-        commands = Commands(KEYS, plant, no_stamp, audit, Acceptance(plant.duty, None))
+        commands = Commands(KEYS, plant, audit, Acceptance(plant.duty, None))
         sender = Sender("client", None, time.monotonic())
         result = asyncio.run(commands.execute(key, data, sender))
     assert [text.encode() for text in recorded] == published

@@ -23,6 +23,7 @@ from gateway.contract.writers import (
     Writers,
 )
 from gateway.errors import ConfigError, NotAllowed, Repeated
+from gateway.northbound.northbound import Files
 from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery
@@ -85,7 +86,7 @@ async def test_only_a_signed_request_writes_and_its_writer_is_named(tmp_path: Pa
     file = secret(tmp_path / "writers.txt", "# plant\n\n" + ALICE)
     plant, endpoint, history = mixer(), free_endpoint(), RecordedWrites()
     settings = ZenohConfig(listen=(endpoint,))
-    northbound = northbound_of(plant, settings, writers=file, history=history)
+    northbound = northbound_of(plant, settings, files=Files(file), history=history)
     begun = past_start()
     async with running(northbound), ZenohPeer("client", connect=[endpoint]) as client:
         audit = await client.subscribe("plant/@gateway/demo/writes")

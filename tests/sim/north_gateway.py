@@ -46,7 +46,7 @@ class Process:
         self.gateway.subscribe(judge)
         self.gateway.subscribe(self.northbound)
         self.gateway.subscribe(self)
-        self.gateway.add_documents(lambda: {"history": self.history.document()})
+        self.gateway.doors.documents.append(lambda: {"history": self.history.document()})
         self._serving: list[asyncio.Task[None]] = []
         self._lines: list[asyncio.Task[None]] = []
 

@@ -105,7 +105,6 @@ class Plant:
             self,
             echo=(self.bench.echo and self.echo_in_file) or None,
             wall=lambda: int(_now() * SECOND),
-            seed=self.bench.seed,
             duty=self.duty,
         )
 

@@ -119,7 +119,7 @@ class Chain:
         own = OwnWrites(keys, self.gateway, Audit(self.outcomes.append))
         self.transfers = Transfers(self.gateway, own.write, config.transfers)
         self.gateway.subscribe(self.transfers)
-        self.gateway.add_documents(self.transfers.documents)
+        self.gateway.doors.documents.append(self.transfers.documents)
         self.alarms = find(parts_of(self.gateway, "alarms"), AlarmPart)
         source = self.stations["vigor"].memory
         for number in (10, 11):

@@ -65,7 +65,7 @@ class Carrier:
         self._plain = own.write
         self.transfers = Transfers(gateway, self.write, rules)
         gateway.subscribe(self)
-        gateway.add_documents(self.transfers.documents)
+        gateway.doors.documents.append(self.transfers.documents)
 
     def publish(self, samples: Sequence[Sample]) -> None:
         for sample in samples:

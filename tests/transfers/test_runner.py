@@ -39,7 +39,7 @@ class Rig:
         gateway = plant.gateway
         self.transfers = Transfers(gateway, self._write, gateway.config.transfers)
         gateway.subscribe(self.transfers)
-        gateway.add_documents(self.transfers.documents)
+        gateway.doors.documents.append(self.transfers.documents)
 
     async def _write(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
         assert within > 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,7 +42,7 @@ class LineConfig:
         return tuple(tag for device in self.devices for tag in device.tags)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Config:
     """One whole file."""
 
@@ -65,7 +66,7 @@ class Config:
         """Returns the settings of a part; None: the file has not its section."""
         return next((one for one in self.parts.values() if isinstance(one, kind)), None)
 
-    @property
+    @cached_property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
 

@@ -43,6 +43,8 @@ class DeviceTags:
             alike = self._built.setdefault((model_of(driver), repr(defaults)), alike)
         tags: list[Tag] = []
         seen: set[str] = set()
+        # Once for all tags: the search for its methods takes a tenth of the time of a tag.
+        fields = driver if isinstance(driver, TypedFields) else None
         rows = with_bits(dict(mapping(raw_tags)), path, driver, self.mistakes)
         for raw_name, raw, place in rows:
             name = self._names.get(raw_name) or self._name(raw_name, place)
@@ -58,7 +60,7 @@ class DeviceTags:
                 tag: Tag | None = known.copy(device, name)
             else:
                 before = len(self.mistakes)
-                tag = self._tag(device, name, raw, place, defaults, driver)
+                tag = self._tag(device, name, raw, place, defaults, driver, fields)
                 if tag is not None and len(self.mistakes) == before:
                     alike[text] = tag
             if tag is not None:
@@ -75,14 +77,15 @@ class DeviceTags:
         place: Path,
         defaults: TagDefaults,
         driver: Addressing | None,
+        fields: TypedFields | None,
     ) -> Tag | None:
         own = section(TagSection, raw, place, self.mistakes, "a tag")
         if own is None or driver is None:
             return None
         unknown_type = isinstance(raw, dict) and "type" in raw and own.type is None
         source = TagSource(device, name, own, defaults, place, type_unknown=unknown_type)
-        if isinstance(driver, TypedFields):
-            return field_tag(source, driver, driver, self.mistakes)
+        if fields is not None:
+            return field_tag(source, driver, fields, self.mistakes)
         return build_tag(source, driver, self.mistakes)
 
     def _note_computed(

@@ -16,9 +16,9 @@ from gateway.contract import payload
 from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Family, ParsedKey, max_age, parse_key, part_of
 from gateway.contract.parsing import check_encoding
-from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.contract.payload import Failure, Problem, Result
 from gateway.contract.question import is_of_past
-from gateway.engine.jobs.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import Peeked
 from gateway.errors import BadValue, Busy, GatewayError
 from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.answering.replies import Replies
@@ -28,7 +28,7 @@ from gateway.northbound.requests.commands import Commands
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
-from gateway.tags import Tag, WriteResult
+from gateway.tags import Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -143,7 +143,7 @@ class Queries:
 
     def _take_keyed(self, query: zenoh.Query, part: str, parsed: ParsedKey, at: float) -> None:
         if query.payload is not None:
-            self._start(self._order(query, part, at))
+            self._start(self._request(query, parsed, at))
         elif query.parameters.get("_time") is not None:
             past = partial(self._replies.past_entries, part, time.time_ns())
             self._reads.answer_history(query, past)
@@ -168,55 +168,38 @@ class Queries:
         self._requests.end()
 
     async def _request(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
-        match parsed.family:
-            case Family.SET:
-                await self._set(query, at)
-            case Family.COMMAND:
-                await self._command(query, at)
-            case _:
-                await self._peek(query, parsed)
-
-    async def _set(self, query: zenoh.Query, at: float) -> None:
-        result: WriteResult | Failure | GroupResult = _ENDING
-        key, by = str(query.key_expr), sender(query, at)
+        """Carries out one request, and answers it in every case."""
+        result: Result = _ENDING
+        key, data, by = str(query.key_expr), _data(query), sender(query, at)
         try:
-            result = await self._writes.write(key, _data(query), by)
+            match parsed.family:
+                case Family.SET:
+                    result = await self._writes.write(key, data, by)
+                case Family.COMMAND:
+                    result = await self._commands.execute(key, data, by)
+                case Family.PEEK:
+                    result = await self._peek(query, parsed)
+                case _:
+                    part = part_of(parsed.target)
+                    result = await self._orders.execute(part, key, data or b"", by)
         finally:
-            self._requests.answer(query, partial(self._replies.outcome, result))
+            pool = self._pool(query, parsed)
+            pool.answer(query, partial(self._replies.outcome, result))
 
-    async def _order(self, query: zenoh.Query, part: str, at: float) -> None:
-        result: bytes | Failure = _ENDING
-        key, by = str(query.key_expr), sender(query, at)
-        try:
-            result = await self._orders.execute(part, key, _data(query) or b"", by)
-        finally:
-            self._requests.answer(query, partial(self._replies.ordered, result))
-
-    async def _command(self, query: zenoh.Query, at: float) -> None:
-        result: CommandResult | Failure = _ENDING
-        key, by = str(query.key_expr), sender(query, at)
-        try:
-            result = await self._commands.execute(key, _data(query), by)
-        finally:
-            self._requests.answer(query, partial(self._commands.reply, result))
-
-    async def _peek(self, query: zenoh.Query, parsed: ParsedKey) -> None:
-        result: Peeked | Failure = _ENDING
+    async def _peek(self, query: zenoh.Query, parsed: ParsedKey) -> Peeked | Failure:
         device = parsed.target.rpartition("/")[2]
         longest = ANSWER_WITHIN + self._plant.dialling(device)
         try:
             check_encoding(encoding_of(query))
             text = (_data(query) or b"").decode(errors="replace")[:_LONGEST_RANGE]
             async with asyncio.timeout(longest):
-                result = await self._plant.peek(device, text)
+                return await self._plant.peek(device, text)
         except TimeoutError:
-            result = Failure(Problem.BUSY, f"not read within {longest:g} s")
+            return Failure(Problem.BUSY, f"not read within {longest:g} s")
         except BadValue as error:
-            result = Failure(Problem.BAD_QUERY, str(error))
+            return Failure(Problem.BAD_QUERY, str(error))
         except GatewayError as error:
-            result = payload.failure(error)
-        finally:
-            self._reads.answer(query, partial(self._replies.peeked, result))
+            return payload.failure(error)
 
     async def _status(self, query: zenoh.Query) -> None:
         documents: dict[str, bytes] = {}

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 
-import orjson
 import zenoh
 
 from gateway.contract import bucket_documents as buckets
@@ -13,18 +12,16 @@ from gateway.contract.buckets import Bucket, Now
 from gateway.contract.interfaces import History, Parts, Plant
 from gateway.contract.keys import Family, Keys, ParsedKey
 from gateway.contract.meta import meta
-from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.contract.payload import Failure, Problem, Result
 from gateway.contract.question import Question, question
-from gateway.engine.jobs.requests import Peeked
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.answering.turns import Pause, Rank, Turns
 from gateway.northbound.publishing import encoding
-from gateway.tags import Sample, Tag, WriteResult
+from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.sample import has_value
-from gateway.tags.timestamps import rfc3339
 
 ANSWER_WITHIN = 60.0  # seconds for a whole answer of history; its client has gone after that
 PAGE_WITHIN = 5.0  # seconds for a page
@@ -285,25 +282,12 @@ class Replies:
         except GatewayError as error:
             self._failed(error, query)
 
-    def ordered(self, result: bytes | Failure, query: zenoh.Query) -> None:
-        if isinstance(result, Failure):
-            self.outcome(result, query)
-        else:
-            self._reply(query, str(query.key_expr), result, self._stamp())
-
     def status(self, documents: dict[str, bytes], query: zenoh.Query) -> None:
         for key, document in documents.items():
             if query.key_expr.intersects(key):
                 self._reply(query, key, document, self._stamp())
 
-    def peeked(self, result: Peeked | Failure, query: zenoh.Query) -> None:
-        if isinstance(result, Failure):
-            self.outcome(result, query)
-            return
-        data = orjson.dumps({**result._asdict(), "time": rfc3339(result.time)})
-        self._reply(query, str(query.key_expr), data, self._stamp())
-
-    def outcome(self, result: WriteResult | Failure | GroupResult, query: zenoh.Query) -> None:
+    def outcome(self, result: Result, query: zenoh.Query) -> None:
         data = payload.outcome(result)
         if payload.failed(result) is not None:
             query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)

@@ -8,9 +8,6 @@ import asyncio
 import time
 from collections.abc import Callable
 
-import orjson
-import zenoh
-
 from gateway.config.commands import TO_ALL, NotControlled
 from gateway.contract import payload
 from gateway.contract.interfaces import Plant
@@ -18,10 +15,8 @@ from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import BadValue, GatewayError
-from gateway.northbound.publishing import encoding
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.writes import ANSWER_WITHIN
-from gateway.tags.timestamps import rfc3339
 
 _LONGEST_ARGUMENT = 1000  # bytes; a loopback takes 254 characters at most
 
@@ -33,14 +28,12 @@ class Commands:
         self,
         keys: Keys,
         plant: Plant,
-        stamp: Callable[[], zenoh.Timestamp],
         audit: Callable[[WriteOutcome], None],
         acceptance: Acceptance,
     ) -> None:
         """`audit` gets every outcome."""
         self._keys = keys
         self._plant = plant
-        self._stamp = stamp
         self._audit = audit
         self._acceptance = acceptance
 
@@ -75,17 +68,6 @@ class Commands:
             told = refused or result
             self._audit(WriteOutcome(key, value, told, time.time_ns(), took, by, command=True))
         return result
-
-    def reply(self, result: CommandResult | Failure, query: zenoh.Query) -> None:
-        """Called on an answering thread."""
-        match result:
-            case CommandResult(answer, at, took):
-                fields = {"answer": answer, "time": rfc3339(at), "took": round(took, 6)}
-                data = orjson.dumps(fields)
-                encoding.reply_json(query, str(query.key_expr), data, self._stamp())
-            case Failure():
-                data = payload.outcome(result)
-                query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)
 
     def _target(self, key: str) -> tuple[str, str]:
         """Returns device and command. Raises `BadValue`."""

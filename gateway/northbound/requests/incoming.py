@@ -17,7 +17,7 @@ from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.commands import Commands
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.orders import Orders
-from gateway.northbound.requests.writes import PutWrites, Writes
+from gateway.northbound.requests.writes import OwnWrites, PutWrites, Writes
 from gateway.tags import WriteResult
 
 T = TypeVar("T")
@@ -46,6 +46,7 @@ class Incoming:
         # Of clients that another part of the gateway has admitted: Zenoh and its writers do not.
         admitted = Acceptance(plant.duty, None)
         self._admitted = Writes(plant, index, audit, admitted)
+        self.own_writes = OwnWrites(keys, plant, audit)
         self._admitted_orders = Orders(keys, parts, audit, admitted)
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
@@ -82,7 +83,7 @@ class Incoming:
         """Returns the declarations that send queries and puts here."""
         stamp = session.new_timestamp
         writes = Writes(self._plant, self._index, self._audit, self._acceptance)
-        commands = Commands(self._keys, self._plant, stamp, self._audit, self._acceptance)
+        commands = Commands(self._keys, self._plant, self._audit, self._acceptance)
         replies = Replies(self._keys, self._plant, self._index, stamp, self._parts)
         orders = Orders(self._keys, self._parts, self._audit, self._acceptance)
         self._queries = Queries(

@@ -58,7 +58,7 @@ class AlarmPart:
 
     def _watch(self) -> None:
         """Follows the conditions of the plant and of other parts."""
-        found = self._plant.conditions
+        found = self._plant.doors.conditions
         found.put("alarms", conditions(self._plant.lines, self._settings))
         self.alarms.watch(found.all(without=() if self._settings.transfers else ("transfers",)))
 

@@ -25,11 +25,11 @@ class StatePart:
         content = await off_loop(self._file.load)
         self._file.restore(self._plant.enabled_devices, content)
         self._plant.mirror.restore(self._file.counters)
-        self._plant.is_restored = True
+        self._plant.doors.is_restored = True
 
     async def run(self) -> None:
         """Raises `GatewayError` where the file was never read: nothing may take its place."""
-        if not self._plant.is_restored:
+        if not self._plant.doors.is_restored:
             raise GatewayError("the state file was not read at the start: it is left as it was")
         self._file.start()
         try:

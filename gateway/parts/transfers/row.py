@@ -65,6 +65,21 @@ class Verdict(NamedTuple):
     why: str
 
 
+class _Retry:
+    """The pause before a write is tried again, which grows with each failure."""
+
+    def __init__(self, now: float) -> None:
+        self.at = now
+        self._pause = FIRST_PAUSE
+
+    def failed(self, now: float) -> None:
+        self.at = now + self._pause
+        self._pause = min(2 * self._pause, LONGEST_PAUSE)
+
+    def ended(self) -> None:
+        self._pause = FIRST_PAUSE
+
+
 class Row:
     """The state of one transfer. Times in seconds of one clock."""
 
@@ -84,7 +99,7 @@ class Row:
         self._substituted = False  # since the source became too old
         self._due = now
         self._next_change = now  # before that no change is carried
-        self._not_before, self._pause = now, FIRST_PAUSE
+        self._retry = _Retry(now)
 
     def changed(self, value: Value) -> None:
         """Notes a good value of the source that was published."""
@@ -93,14 +108,14 @@ class Row:
 
     def target_online(self, now: float) -> None:
         """Tries a write again at once: the target replies."""
-        if now < self._not_before:
+        if now < self._retry.at:
             self._next_change = now
-        self._not_before, self._pause = now, FIRST_PAUSE
+        self._retry = _Retry(now)
 
     def next(self, source: Reading, now: float) -> Carry | None:
         """Returns the write that is due, which begins now; its end is reported to `ended`."""
         value = self._note_age(source, now)
-        if self.writing is not None or now < self._not_before:
+        if self.writing is not None or now < self._retry.at:
             return None
         if value is None:
             self.writing = self._substitute(now)
@@ -168,7 +183,7 @@ class Row:
         if outcome.end is End.NOT_DONE:
             self._again(carry, now)
             return
-        self._pause = FIRST_PAUSE
+        self._retry.ended()
         if outcome.end is End.DONE:
             self.carried_at = now
         done = outcome.end is End.DONE and not carry.substitute
@@ -176,17 +191,17 @@ class Row:
 
     def _again(self, carry: Carry, now: float) -> None:
         """The write was certainly not done: it is due again after a pause, if it still holds."""
-        self._not_before = self._next_change = now + self._pause
-        self._pause = min(2 * self._pause, LONGEST_PAUSE)
+        self._retry.failed(now)
+        self._next_change = self._retry.at
         if carry.substitute:
             self._substituted = False
         else:
-            self._want(self._not_before)
+            self._want(self._retry.at)
 
     def wake(self, now: float) -> float:
         """Returns the time of the next look, if the source does not change before."""
-        if now < self._not_before:
-            return self._not_before
+        if now < self._retry.at:
+            return self._retry.at
         soon = now + min(LOOK_EVERY, self.rule.stale / _LOOKS)
         looks = self._wanted or self.rule.substitute is not None or self._fills
         if self.rule.every is None:

@@ -13,7 +13,8 @@ from gateway.errors import GatewayError
 from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
 from gateway.parts.transfers.row import Row, State
-from gateway.plant.conditions import Condition, Conditions, Reading
+from gateway.plant.conditions import Condition, Reading
+from gateway.plant.doors import Doors
 from gateway.tags import AlarmRule, Level, Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.timestamps import rfc3339
 from gateway.tags.transfer import TransferRule
@@ -31,7 +32,7 @@ class Plant(Protocol):
     """The samples of the gateway, and its status."""
 
     @property
-    def conditions(self) -> Conditions: ...
+    def doors(self) -> Doors: ...
 
     def tag(self, key: str) -> Tag | None: ...
 
@@ -152,7 +153,7 @@ class Transfers:
             text = f"{one.name} from {source} to {target} does not work"
             rule = AlarmRule({Level.STOPPED: True}, delay=ALARM_DELAY, text=text)
             wanted[f"{TRANSFER}{one.rule.number}"] = Condition(rule, partial(self._look, one))
-        self._plant.conditions.put(FOLDER, wanted)
+        self._plant.doors.conditions.put(FOLDER, wanted)
 
     async def stop(self) -> None:
         """Ends all rows at once. A write that is under way is reported as unclear."""

@@ -39,19 +39,17 @@ class AlarmApi:
     def routes(self) -> list[Route]:
         return [
             Route(
-                path="/api/alarms",
-                handler=self._alarms,
-                name="alarms",
-                about="Alarms, those without acknowledgement first, in pages",
+                "/api/alarms",
+                self._alarms,
+                "Alarms, those without acknowledgement first, in pages",
                 parameters=(_STATE, _AFTER, LIMIT),
                 reply=ref("Alarms"),
                 errors={400: "A wrong state or limit"},
             ),
             Route(
-                path="/api/alarms/acknowledge",
-                handler=self._acknowledge,
-                name="acknowledge",
-                about="Acknowledges one alarm for an operator; a repeat gets the same answer",
+                "/api/alarms/acknowledge",
+                self._acknowledge,
+                "Acknowledges one alarm for an operator; a repeat gets the same answer",
                 method="post",
                 parameters=(_ALARM,),
                 body=ref("Acknowledgement"),

@@ -26,4 +26,4 @@ def file(path: str, body: bytes, kind: str) -> Route:
     async def asset(_: web.Request) -> web.Response:
         return web.Response(body=body, content_type=kind, charset="utf-8")
 
-    return Route(path=path, handler=asset, is_open=True)
+    return Route(path, asset, is_open=True)

@@ -98,10 +98,9 @@ class Events:
     def routes(self) -> list[Route]:
         return [
             Route(
-                path="/api/events",
-                handler=self.handle,
-                name="events",
-                about="Server-sent events of the status page; their content may change",
+                "/api/events",
+                self.handle,
+                "Server-sent events of the status page; their content may change",
                 parameters=(_LINE, _DEVICE, _AFTER),
                 kind="text/event-stream",
                 done="Events",

@@ -50,7 +50,8 @@ def _operation(route: Route) -> dict[str, Any]:
         _parameter(one.name, "query", one.schema, required=one.required, about=one.about)
         for one in route.parameters
     ]
-    found: dict[str, Any] = {"operationId": route.name, "summary": route.about}
+    name = route.path.rpartition("/")[2].strip("{}")
+    found: dict[str, Any] = {"operationId": name, "summary": route.about}
     if places or asked:
         found["parameters"] = places + asked
     if route.body is not None:

@@ -4,7 +4,7 @@ The server registers the routes, and `openapi` describes them, from the same lis
 """
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Protocol
 
 from aiohttp import web
@@ -93,14 +93,14 @@ class Count:
 LIMIT = Count("limit", "Items of this page, 200 if left out", 1, 1000, 200)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Route:
     """One address. Without `about` it is not described: a file of the page."""
 
     path: str
     handler: Handler
-    name: str = ""  # of the operation
     about: str = ""
+    _: KW_ONLY
     method: str = "get"
     parameters: tuple[Parameter, ...] = ()
     body: Schema | None = None

@@ -38,7 +38,7 @@ class ResyncKind:
         """Notes that no sound reply arrived."""
         if loopback:
             self._misses += 1
-            if self._loops and self._misses >= _READ_MISSES:
+            if self._loops and self._misses >= _MISSES:
                 self._loops = None
             return
         self._read_misses += 1
