@@ -70,6 +70,22 @@ def assigns_state(tree: ast.Module) -> bool:
     return False
 
 
+def foreign_assignments(room: str) -> int:
+    """Assignments in a folder to an attribute of an object other than `self` or `cls`."""
+    return sum(
+        isinstance(node, ast.Attribute)
+        and isinstance(node.ctx, ast.Store)
+        and getattr(node.value, "id", "") not in ("self", "cls")
+        for path in sorted((ROOT / room).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+    )
+
+
+def rooms() -> list[str]:
+    """The folders of gateway/."""
+    return sorted(path.name for path in ROOT.iterdir() if (path / "__init__.py").exists())
+
+
 def is_settings(file: str, node: ast.ClassDef) -> bool:
     """Frozen dataclasses and models of the file are settings records."""
     frozen = any("frozen=True" in ast.unparse(decorator) for decorator in node.decorator_list)
@@ -98,6 +114,8 @@ def main() -> None:
     print(f"most fields of a class: {largest[0]} ({largest[2]})")
     print(f"most arguments of a constructor: {widest[1]} ({widest[2]})")
     print(f"modules that assign state of a device from outside: {assigning}")
+    foreign = {room: foreign_assignments(room) for room in rooms()}
+    print(f"rooms: {len(foreign)}; assignments to attributes of other objects: {foreign}")
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""What users see, on Zenoh, HTTP and the command line: keys, documents, rights."""
+"""The contract with users, on Zenoh, HTTP and the command line: keys, documents, rights."""

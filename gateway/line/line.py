@@ -7,7 +7,7 @@ back; the engine's effects go to the clients, the sample sink and the log.
 import asyncio
 import random
 import time
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -95,12 +95,12 @@ class Line:
     def write_group(
         self,
         device: Device,
-        values: Iterable[tuple[Tag, Sequence[int]]],
+        values: Sequence[tuple[Tag, Sequence[int]]],
         within: float = WRITE_EXPIRY,
     ) -> list[asyncio.Future[WriteResult]]:
         """Writes several tags in their order, as `write`. After the first that is not done the
-        others are not sent: they raise `NotSent`."""
-        now, group = _now(), Group()
+        others are not sent: they raise `NotSent`. One alone may share a request with others."""
+        now, group = _now(), Group() if len(values) > 1 else None
         writes = [Write(device, tag, units, now, within, group=group) for tag, units in values]
         loop = asyncio.get_running_loop()
         ends = [loop.create_future() for _ in writes]

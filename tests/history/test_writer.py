@@ -6,7 +6,6 @@ import shutil
 import sqlite3
 import time
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ import pytest
 from gateway.errors import Busy
 from gateway.parts.history.file import HistoryFile
 from gateway.parts.history.historian import Historian
-from tests.e2e.processes import slowed
 from tests.history.recorded import (
     EVERYTHING,
     SPEED,
@@ -30,7 +28,7 @@ from tests.history.recorded import (
 from tests.history_writer import NOBODY, TAGS, WEEK, until
 
 
-def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path) -> None:
+def test_kill_9_costs_nothing_that_is_said_to_be_stored_and_never_the_file(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     at = random.Random(9)
     stored_before = 0
@@ -38,15 +36,12 @@ def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path)
         process = start_writer("run", path)
         assert process.stdout is not None
         output = [process.stdout.readline()]
-        output += islice(process.stdout, at.randrange(25, 350))  # any moment
+        time.sleep(at.uniform(0.05, 0.7))  # any moment
         process.kill()
-        killed = time.monotonic_ns()
         output += process.stdout.read().splitlines()
         process.wait()
         process.stdout.close()
-        last = killed - slowed(200_000_000)
-        told = [tuple(map(int, line.split())) for line in output]
-        must = [number for number, at_time in told if at_time < last]
+        must = [int(line) for line in output]
         shutil.copytree(tmp_path, tmp_path.with_name("copy"), dirs_exist_ok=True)
         assert is_intact(tmp_path.with_name("copy") / "h.db")
         with history(path) as historian:
@@ -132,7 +127,7 @@ def test_another_program_that_holds_the_file_only_delays(tmp_path: Path) -> None
             other.execute("BEGIN IMMEDIATE")
             begun = time.perf_counter()
             historian.record(numbered(10, 10))
-            assert time.perf_counter() - begun < slowed(0.05)
+            assert time.perf_counter() - begun < 0.05
             assert values(historian) == list(range(20))
             wait_for_state(historian, "another program")
             assert values(historian) == list(range(20))

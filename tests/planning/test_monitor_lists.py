@@ -86,11 +86,11 @@ def test_a_list_never_costs_more_and_every_tag_is_read_once() -> None:
 
 def test_refused_addresses_are_in_no_list() -> None:
     _, dev = one(*SCATTERED)
-    dev.monitor.allow(False)
+    dev.monitor.refused(0.0)
     dev.plan()
     bad = next(block for block in dev.blocks if block.tags[0].text == "D800")
     dev.bad_addresses.refused(bad, 0, "06")
-    dev.monitor.allow(True)
+    dev.monitor.allow()
     dev.plan()
     [block] = listed(dev)
     assert {tag.text for tag in block.tags} == set(SCATTERED) - {"D800"}
@@ -281,7 +281,7 @@ async def test_a_change_of_blocks_keeps_the_age_of_the_values() -> None:
         await asyncio.sleep(5)
         assert line.good(dev)
         for lists in (True, False):
-            dev.monitor.allow(lists)
+            dev.monitor.allowed = lists
             dev.plan()
             line.line.engine.schedule.plan(dev, now())
         line.stations[0].mute = True

@@ -32,7 +32,7 @@ class Written(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """What a section may know of the whole file. Its mistakes are noted here."""
+    """The parts of the whole file that a section may use. Its mistakes are noted here."""
 
     mistakes: Mistakes
     folder: FilePath  # of the file

@@ -14,6 +14,7 @@ from gateway.protocols.driver import Span
 from gateway.tags import Reason
 
 PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
+PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
 PROBE_SPREAD = 0.1  # share by which it varies
 MOST_UNANSWERED = 64  # unanswered requests whose times are kept
@@ -45,6 +46,7 @@ class Heard(Enum):
     GAVE_UP = 2  # it replied no longer
 
 
+OF_THE_WIRE = (Evidence.NOISE, Evidence.CHECKSUM, Evidence.TRUNCATED)
 _S, _E = State, Event
 TRANSITIONS: Mapping[tuple[State, Event], State] = {
     (_S.STARTING, _E.ANSWERED): _S.ONLINE,
@@ -85,7 +87,9 @@ class Health:
     pause: float = 0.0  # seconds until the next probe of an offline device
     next_probe: float = 0.0
     short_probes: int = 0  # since the last patient one, or the last reply
+    patient: bool = False  # its next probe waits for the whole `reply_timeout`: it replies late
     _last_probe: float = -math.inf  # of an offline device
+    _last_bytes: float = -math.inf  # damaged replies are a sign of life
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
@@ -136,6 +140,8 @@ class Health:
         """
         self._move(Event.UNCLEAR)
         self.consecutive_failures += 1
+        if isinstance(error, Garbled) and error.evidence in OF_THE_WIRE:
+            self._last_bytes = now
         self._unanswered.append(now)
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
@@ -171,17 +177,34 @@ class Health:
     def gave_up(self, now: float, spread: float) -> None:
         """Makes the device offline, and doubles the pause before its next probe.
 
+        It is short while damaged replies arrive: then the wire is the trouble.
+
         `spread`: a random factor near 1, so that many devices are not probed at once.
         """
         self._move(Event.GAVE_UP)
         self.heard = Heard.GAVE_UP
         self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
+        if self.is_alive(now):
+            self.pause = PAUSE_ALIVE
         self.next_probe = now + self.pause * spread
         self._last_probe = now
 
     def may_be_probed(self, now: float) -> bool:
         """Returns True if its last probe is old enough for one on behalf of a client."""
         return self._last_probe + PAUSE_FIRST <= now
+
+    def is_alive(self, now: float) -> bool:
+        """Returns True if damaged replies of it arrived a short time ago."""
+        return now - self._last_bytes < ALIVE_FOR
+
+    def spoke(self, now: float, longest_reply: float) -> None:
+        """Notes a sound frame of an offline device: it replies later than a short probe waits."""
+        if self.state is not State.OFFLINE or self.patient:
+            return
+        self.patient = True
+        if now - self._last_probe <= longest_reply:
+            self.next_probe = now
+        self.probe_soon()
 
     def probe_soon(self) -> None:
         """Shortens the pause, because a client waits."""
@@ -190,6 +213,8 @@ class Health:
     def probed(self, *, short: bool) -> None:
         """Counts a probe that is sent."""
         self.short_probes = self.short_probes + 1 if short else 0
+        if not short:
+            self.patient = False
 
     def next_probe_token(self) -> int:
         """Returns a token for a resync. The token after it is free for a second resync request."""

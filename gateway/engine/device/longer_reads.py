@@ -1,5 +1,6 @@
 """Chooses longer spans to read for a block, so that its replies differ in shape."""
 
+import math
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 
@@ -12,6 +13,7 @@ LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte 
 MOST_CHOICES = 3  # shapes of one block: an extra reply that is late by two requests is noticed
 MOST_WARY = 8  # shapes of one block while the device answers twice
 MOST_FAILED = 3  # reads in a row of the longer span without a reply
+REFUSED_FOR = 3600.0  # seconds until a longer read that was refused is tried again
 KNOWN_FOR = 600.0  # seconds for which a device that comes back has the addresses that it had
 
 Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
@@ -20,7 +22,17 @@ Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
 class LongerReads:
     """The spans that may be read for each block of one device."""
 
-    __slots__ = ("_bad", "_driver", "_hull", "_lacking", "_shapes", "alone", "by_span", "failed")
+    __slots__ = (
+        "_bad",
+        "_driver",
+        "_hull",
+        "_lacking",
+        "_shapes",
+        "alone",
+        "by_span",
+        "failed",
+        "forget_at",
+    )
 
     def __init__(
         self,
@@ -38,6 +50,7 @@ class LongerReads:
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
         self.alone: set[Span] = set()  # to be read without other addresses once
+        self.forget_at = math.inf  # when `forget` must be called
 
     def choices(self, span: Span) -> list[Choice]:
         """Returns the span itself, then longer ones whose replies have other shapes."""
@@ -61,6 +74,17 @@ class LongerReads:
         _, lacking = self._lacking.get(span, (now, []))
         self._lacking[span] = now, [*lacking, longer]
         self.by_span.pop(span, None)
+        self.forget_at = min(self.forget_at, now + REFUSED_FOR)
+
+    def forget(self, now: float) -> None:
+        """Forgets refusals that are an hour old: the device may have these addresses now."""
+        for span, (refused, _) in list(self._lacking.items()):
+            if now - refused >= REFUSED_FOR:
+                del self._lacking[span]
+                self.by_span.pop(span, None)
+                self.failed.pop(span, None)
+        self.forget_at = min((at for at, _ in self._lacking.values()), default=math.inf)
+        self.forget_at += REFUSED_FOR
 
     def refused_alone(self, span: Span, read: float | None) -> None:
         """Notes that the span is refused too. If it was not read since, those beside it may exist.

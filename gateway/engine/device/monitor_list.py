@@ -1,8 +1,11 @@
 """The monitor list of one device: the addresses that its PLC reads with one short request."""
 
+import math
 from dataclasses import dataclass
 
 from gateway.protocols.driver import Span
+
+REFUSED_FOR = 3600.0  # seconds
 
 
 @dataclass(slots=True)
@@ -11,6 +14,7 @@ class MonitorList:
 
     registered: tuple[Span, ...] = ()
     allowed: bool = True
+    again: float = math.inf  # when it is allowed again, after it was refused
 
     def must_register(self, spans: tuple[Span, ...]) -> bool:
         """Notes the list that is read next. Returns True if it must be registered first."""
@@ -21,6 +25,10 @@ class MonitorList:
         """Forgets the list: the PLC may have restarted, or another master may have changed it."""
         self.registered = ()
 
-    def allow(self, allowed: bool) -> None:
-        """Allows or forbids lists: a PLC that refuses its list is read without one."""
-        self.allowed = allowed
+    def refused(self, now: float) -> None:
+        """Forbids lists: a PLC that refuses its list is read without one for an hour."""
+        self.allowed, self.again = False, now + REFUSED_FOR
+
+    def allow(self) -> None:
+        """Allows lists again."""
+        self.allowed, self.again = True, math.inf

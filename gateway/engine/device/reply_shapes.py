@@ -153,6 +153,8 @@ class ReplyShapes:
         self.proven, self.mark_due = now, now + self._mark
         if now - self.extra_at >= WARY_FOR:
             self.quiet = QUIET
+        if now >= self.longer.forget_at:
+            self.longer.forget(now)
 
     def extra_arrived(self, now: float) -> None:
         """Notes an extra reply."""

@@ -15,6 +15,7 @@ from gateway.errors import DeviceError
 
 FIRST_WAIT, LONGEST_WAIT = 3.0, 10.0  # seconds of a bridge for a dead unit: expected, at most
 MARGIN = 1.2  # of a measured wait
+SEEN_FOR = 3600.0  # seconds after which a shorter wait takes the place of the longest one
 MOST_KEPT, KEPT = 64, 60.0  # requests, seconds
 
 
@@ -39,6 +40,7 @@ class Unanswered:
     def __init__(self) -> None:
         self.requests: deque[TimedOut] = deque(maxlen=MOST_KEPT)
         self.longest = 0.0  # seconds for which a request was seen to hold up others
+        self._seen_at = 0.0
 
     def timed_out(
         self, device: Device, request: Any, answers: Callable[[Any], Any], sent: float
@@ -95,7 +97,8 @@ class Unanswered:
     def _measure(self, holding: list[TimedOut], now: float) -> None:
         if holding:
             seen = now - min(each.sent for each in holding)
-            self.longest = min(max(self.longest, seen), LONGEST_WAIT)
+            if seen >= self.longest or now - self._seen_at >= SEEN_FOR:
+                self.longest, self._seen_at = min(seen, LONGEST_WAIT), now
 
 
 def _answers(request: TimedOut, frame: Any) -> bool:

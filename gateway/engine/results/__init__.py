@@ -1,1 +1,1 @@
-"""What follows from a result: the rules of the engine."""
+"""The rules of the engine: the consequences of a result."""

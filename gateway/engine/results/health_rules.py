@@ -107,6 +107,10 @@ class HealthRules:
         for request in self._schedule.requests.withdraw(device):
             self._effects.ended(request, offline(device))
 
+    def spoke(self, device: Device, now: float) -> None:
+        """Applies a sound frame of a device, which no request waits for."""
+        device.health.spoke(now, device.longest_reply)
+
     def answered_twice(self, device: Device, now: float, time: int) -> None:
         """Applies a reply to no request: values read just before may be those of other tags.
 

@@ -6,6 +6,7 @@ from typing import Any
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
+from gateway.engine.device.monitor_list import REFUSED_FOR
 from gateway.engine.effects import Effects, Samples
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.schedule.poll_entry import PollEntry
@@ -173,10 +174,11 @@ class PollRules:
             return
         device = poll.device
         self._effects.warning("monitor list refused", device=device.name, why=str(error))
-        device.monitor.allow(False)
+        device.monitor.refused(now)
         device.bad_addresses.abandon()
         device.plan()
         self._schedule.plan(device, now)
+        self._replans.want(device, now, REFUSED_FOR)
 
     def _end_badly(
         self,
@@ -195,7 +197,7 @@ class PollRules:
 
     def _end_search(self, device: Device, now: float) -> None:
         if device.bad_addresses.settle(now):
-            device.monitor.allow(True)  # the bad address in the list may be known now
+            device.monitor.allow()  # the bad address in the list may be known now
             self._replans.want(device, now)
 
     def unread(

@@ -60,6 +60,7 @@ class Stray(Rule):
                 device.record.count_stray(len(own))
                 self._log_frames(device, own, now)
                 if any(_is_extra_reply(device, frame) for frame in own):
+                    self._results.spoke(device, now)
                     self._results.answered_twice(device, now, time)
 
     def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
@@ -68,6 +69,7 @@ class Stray(Rule):
         self._log_frames(device, [frame], now)
         for each in self._devices:
             if not echo and _is_extra_reply(each, frame):
+                self._results.spoke(each, now)
                 self._results.answered_twice(each, now, time)
 
     def _log_frames(self, device: Device, frames: Iterable[Any], now: float) -> None:

@@ -78,10 +78,13 @@ class ProbeSchedule:
 
     def _offline(self, device: Device, now: float, idle_until: float) -> Probe | None:
         """Returns the probe that the wire has time for, if any."""
+        health, alive = device.health, device.health.is_alive(now)
+        if alive:  # its damaged replies show that the wire is the trouble
+            return self.probe(device) if idle_until > now or self.failing_lane <= now else None
         if idle_until <= now < self._offline_lane:
             return None
         short = short_timeout(device, self._devices)
-        if short is None or device.health.short_probes >= PATIENT_AFTER:
+        if short is None or health.patient or health.short_probes >= PATIENT_AFTER:
             fits = idle_until - now >= probe_seconds(device)
             self._in_idle_time = fits and not device.driver.traits.over_network
             if self._in_idle_time or self._offline_lane <= now:
@@ -111,6 +114,9 @@ class ProbeSchedule:
     def went_offline(self, device: Device, now: float, took: float) -> None:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
         device.health.gave_up(now, self._random.uniform(1 - PROBE_SPREAD, 1 + PROBE_SPREAD))
+        if device.health.is_alive(now):
+            self.failing_lane = now + took
+            return
         if self._in_idle_time:
             return
         self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if self._any_online else now

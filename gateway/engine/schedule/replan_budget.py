@@ -38,10 +38,14 @@ class ReplanBudget:
             self.next_at = due
             return
         device.bad_addresses.abandon()
+        if device.monitor.again <= now:
+            device.monitor.allow()
         self.spent(device.plan_changes(), now)
         self._schedule.plan(device, now)
         if not device.bad_addresses.changed:
-            del self._waiting[device]
+            self._waiting[device] = device.monitor.again
+            if device.monitor.again == math.inf:
+                del self._waiting[device]
         self.look(now)
 
     def spent(self, seconds: float, now: float) -> None:

@@ -1,1 +1,1 @@
-"""What the gateway has learned of its devices, kept across restarts."""
+"""The state file: knowledge of devices, kept across restarts."""

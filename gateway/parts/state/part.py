@@ -15,7 +15,7 @@ CLOSE_WITHIN = 0.5  # seconds; a lost state file costs only a new search
 
 
 class StatePart:
-    """What was learned of the devices, and the totals of counters."""
+    """Knowledge of the devices, and the totals of counters."""
 
     def __init__(self, core: Core, file: StateFile) -> None:
         self._plant = core.plant

@@ -24,7 +24,7 @@ class Settings(BaseModel):
 
 
 class Facts(NamedTuple):
-    """What the checks of a feature may know of the tag."""
+    """The parts of the tag that the checks of a feature may use."""
 
     kind: ValueType
     text: str  # the address as the file writes it

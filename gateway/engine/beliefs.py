@@ -1,0 +1,162 @@
+"""The table of all that a line learns: evidence, contradiction, and how soon it is given up."""
+
+from typing import NamedTuple
+
+from gateway.engine.device.device import ECHO_PROVEN_FOR
+from gateway.engine.device.health import PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
+from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
+from gateway.engine.device.reply_shapes import WARY_FOR
+from gateway.engine.device.station_silence import FORGOTTEN_AFTER
+from gateway.engine.device.turnaround import LEARN_EVERY
+from gateway.engine.jobs.unanswered import SEEN_FOR
+from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
+from gateway.engine.results.pipelining import TRY_AGAIN
+from gateway.planning.bad_addresses import RETRIES, SPLIT_LONGEST
+
+AT_ONCE = 0.0
+
+
+class Belief(NamedTuple):
+    """Something that a line learns of an address, a device or its adapter. None is for ever."""
+
+    name: str
+    evidence: str
+    contradicted_by: str
+    then: str
+    within: float  # seconds: given up so long after the contradiction, or the evidence, at most
+
+
+BELIEFS = (
+    Belief(
+        "the adapter echoes",
+        "a reply came behind its request",
+        "a reply without its request",
+        "a reply that equals the request is one again",
+        AT_ONCE,
+    ),
+    Belief(
+        "the adapter does not echo",
+        "a reply without its request",
+        "a reply behind its request; for a write also a reply that is too quick, "
+        f"or no other reply for {ECHO_PROVEN_FOR:g} s",
+        "an equal reply acknowledges nothing; a read proves the write",
+        AT_ONCE,
+    ),
+    Belief(
+        "turnaround",
+        "measured, smoothed over ten replies",
+        f"{LEARN_EVERY} replies with another one",
+        "forecasts and plans use the new one",
+        LEARN_EVERY * 1.0,
+    ),
+    Belief(
+        "a shorter silence is enough",
+        "replies to all polls after it",
+        "a poll without a good reply, or bytes that answer nothing",
+        "the safe silence",
+        AT_ONCE,
+    ),
+    Belief(
+        "a silence is too short",
+        "a request after it was lost",
+        "time: it is tried again, twice as late after each loss",
+        "the shorter silence",
+        FORGOTTEN_AFTER,
+    ),
+    Belief(
+        "answers twice",
+        "a reply to no request",
+        "no such reply for ten minutes",
+        "fewer shapes, shorter waits",
+        WARY_FOR,
+    ),
+    Belief(
+        "takes one request at a time",
+        "requests that were answered alone and not beside others",
+        "a transaction in which all were answered; it is tried every hour",
+        "requests share a transaction",
+        TRY_AGAIN,
+    ),
+    Belief(
+        "refused address",
+        "the device refuses it, or is silent about it",
+        "a good read; it is tried again after growing pauses",
+        "it is read in its block",
+        RETRIES[-1],
+    ),
+    Belief(
+        "block too long",
+        "both halves were read, the block not",
+        "a good read of the whole; tried again after growing pauses",
+        "it is one block again",
+        SPLIT_LONGEST,
+    ),
+    Belief(
+        "refuses monitor lists",
+        "it refused its list twice",
+        "time: it is tried again",
+        "the list is registered again",
+        LIST_REFUSED_FOR,
+    ),
+    Belief(
+        "refuses a longer read",
+        "it refused, or was silent three times",
+        "time: it is tried again",
+        "the longer read alternates with the block",
+        LONGER_REFUSED_FOR,
+    ),
+    Belief(
+        "a bridge waits for a dead unit",
+        "requests to others that were answered late",
+        "shorter waits only, for an hour",
+        "the shorter wait",
+        SEEN_FOR,
+    ),
+    Belief(
+        "a device is busy",
+        "two busy replies in a row",
+        "another reply; it is polled again after each pause",
+        "it is polled as usual",
+        LONGEST_BUSY,
+    ),
+    Belief(
+        "a device is offline",
+        "more requests without a reply than `retries`",
+        "a reply to a probe",
+        "it is polled",
+        PROBE_PAUSE * (1 + PROBE_SPREAD),
+    ),
+    Belief(
+        "a device that returns is as quick as before",
+        "its measured turnaround",
+        "a sound frame after a short probe",
+        "the next probe waits for the whole reply_timeout, and is due",
+        AT_ONCE,
+    ),
+    Belief(
+        "earlier requests are kept",
+        "the line or the device is new",
+        "a wire that was quiet for reply_timeout and late_guard",
+        "one resync is enough",
+        AT_ONCE,
+    ),
+)
+
+
+def table() -> str:
+    """Returns the beliefs as a table of Markdown."""
+    head = "| belief | evidence | contradicted by | then | given up |\n|---|---|---|---|---|"
+    rows = (
+        f"| {one.name} | {one.evidence} | {one.contradicted_by} | {one.then} | {_within(one)} |"
+        for one in BELIEFS
+    )
+    return "\n".join((head, *rows))
+
+
+def _within(belief: Belief) -> str:
+    if belief.within == AT_ONCE:
+        return "at once"
+    if belief.name == "turnaround":
+        return f"after {belief.within:g} replies"
+    return f"within {belief.within:g} s"

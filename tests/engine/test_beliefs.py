@@ -1,0 +1,332 @@
+"""No belief is for ever: each is contradicted after an hour of its truth, and given up in time."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.engine.beliefs import BELIEFS, Belief, table
+from gateway.engine.device.health import PROBE_SPREAD, State
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
+from gateway.engine.jobs.unanswered import Unanswered
+from gateway.engine.results.busy_devices import BusyDevices
+from gateway.engine.results.pipelining import Pipelining
+from gateway.engine.results.shorter_silences import ShorterSilences
+from gateway.errors import Evidence, Garbled, NoReply, Refusal, Refused
+from gateway.line.channel import Echo
+from gateway.planning.planner import Block
+from tests.engine.rig import SILENCE, Rig, link_device, tcp_device
+
+HOUR = 3600.0
+PAGE = Path(__file__).parents[2] / "docs" / "beliefs.md"
+ASKED, SAID = b"\x01\x03\x00\x00\x00\x01", b"\x01\x03\x02\x00\x07"
+BUSY = Refused("busy", code="06", refusal=Refusal.BUSY)
+NO_ADDRESS = Refused("no such address", code="07", refusal=Refusal.ADDRESS)
+Way = Callable[[float], bool]  # is it given up, so many seconds after the contradiction?
+
+
+def test_the_page_has_the_table_of_the_code() -> None:
+    assert table() in PAGE.read_text("utf-8")
+
+
+def echo(*, first: bytes, then: bytes) -> Way:
+    adapter = Echo("line", None)
+    for _ in range(int(HOUR)):
+        adapter.learn(ASKED, first, len(SAID))
+    before = adapter.found
+    adapter.learn(ASKED, then, len(SAID))
+    return lambda _: adapter.found is not before
+
+
+def turnaround() -> Way:
+    device = link_device()
+
+    def answered(count: int, seconds: float) -> None:
+        for _ in range(count):
+            device.record.count_exchanges(1, 0.01, seconds)
+            device.learn_turnaround()
+
+    answered(int(HOUR), 0.005)
+
+    def given_up(replies: float) -> bool:
+        answered(2 * int(replies), 0.25)
+        return (device.turnaround.expected or 0.0) > 0.2
+
+    return given_up
+
+
+def rule_of(rig: Rig, kind: type[Any]) -> Any:
+    return next(rule for rule in rig.engine.rules.all if isinstance(rule, kind))
+
+
+def shorter_silence() -> Way:
+    rig = Rig(link_device())
+    rule: ShorterSilences = rule_of(rig, ShorterSilences)
+    device, rule.step = rig.device, 3
+    device.silence.take_step(3, HOUR)
+    device.silence.keep(device.silence.shorter)
+    rule.failed(device, NoReply("no reply"), device.silence.safe / 8, HOUR)
+    return lambda _: rule.step == 0 and device.silence.kept == device.silence.safe
+
+
+def silence_too_short() -> Way:
+    silence = link_device().silence
+    silence.least = silence.safe / 8  # it may be shortened
+    silence.was_too_short(silence.safe / 2, 0.0)
+
+    def given_up(after: float) -> bool:
+        silence.take_step(3, after)
+        return silence.shorter < silence.safe
+
+    assert not given_up(HOUR - 1)
+    return given_up
+
+
+def answers_twice() -> Way:
+    shapes = link_device().shapes
+    assert shapes is not None
+    usual = shapes.quiet
+    for second in range(0, int(HOUR), 60):
+        shapes.extra_arrived(float(second))
+    last = HOUR - 60
+
+    def given_up(after: float) -> bool:
+        shapes.marked(last + after)
+        return shapes.quiet == usual
+
+    assert not given_up(60.0)
+    return given_up
+
+
+def one_at_a_time() -> Way:
+    rig = Rig(tcp_device())
+    rule: Pipelining = rule_of(rig, Pipelining)
+    device = rig.device
+    one, other = (Poll(device, block, block.span) for block in device.blocks[:2])
+    for _ in range(3):
+        rule._ended(one, 2, [one], 0.0)
+        rule._ended(one, 1, [], 0.0)
+    assert device.one_at_a_time
+    assert rule.beside(other, HOUR - 1) == 0
+
+    def given_up(after: float) -> bool:
+        if rule.beside(other, after) > 0:
+            rule._ended(one, 2, [], after)
+        return not device.one_at_a_time
+
+    return given_up
+
+
+def polls_until(rig: Rig, end: float, result: Callable[[Poll], Any]) -> None:
+    """Performs all jobs until then."""
+    while rig.now < end:
+        job = rig.next()
+        match job:
+            case Idle(until):
+                rig.now = min(until, end)
+            case Poll():
+                rig.conclude(job, result(job))
+            case Probe():
+                rig.conclude(job, Resynced(9))
+            case Settle():
+                rig.conclude(job, Settled(None))
+            case _:
+                raise AssertionError(job)
+
+
+def refused_address() -> Way:
+    rig = Rig(link_device())
+    rig.bring(State.ONLINE)
+
+    def without_d3(poll: Poll) -> Any:
+        _, start, size = poll.span
+        return NO_ADDRESS if start <= 3 < start + size else [0] * size
+
+    polls_until(rig, HOUR, without_d3)
+    assert rig.device.bad_addresses.bad
+    end = rig.now
+
+    def given_up(after: float) -> bool:
+        polls_until(rig, end + after + 5.0, lambda poll: [0] * poll.span.size)
+        return not rig.device.bad_addresses.bad and len(rig.device.blocks) == 1
+
+    return given_up
+
+
+def block_too_long() -> Way:
+    rig = Rig(link_device())
+    rig.bring(State.ONLINE)
+
+    def short_ones(poll: Poll) -> Any:
+        return NO_ADDRESS if poll.span.size > 4 else [0] * poll.span.size
+
+    polls_until(rig, HOUR, short_ones)
+    assert rig.device.bad_addresses.splits
+    end = rig.now
+
+    def given_up(after: float) -> bool:
+        polls_until(rig, end + min(after, HOUR), lambda poll: [0] * poll.span.size)
+        return not rig.device.bad_addresses.splits
+
+    return given_up
+
+
+def monitor_list() -> Way:
+    monitor = link_device().monitor
+    monitor.refused(0.0)
+    assert not monitor.allowed
+    rig = Rig(link_device())
+    rig.bring(State.ONLINE)
+    rig.device.monitor.refused(0.0)
+    replans = rig.engine._polls._replans
+    replans.want(rig.device, 0.0)
+
+    def given_up(after: float) -> bool:
+        polls_until(rig, after + 5.0, lambda poll: [0] * poll.span.size)
+        return rig.device.monitor.allowed
+
+    return given_up
+
+
+def longer_read() -> Way:
+    shapes = link_device().shapes
+    assert shapes is not None
+    longer = shapes.longer
+    block: Block = link_device().blocks[0]
+    usual = longer.choices(block.span)
+    for refused in usual[1:]:
+        longer.refused(block.span, refused[0], 0.0)
+    assert longer.choices(block.span) != usual
+
+    def given_up(after: float) -> bool:
+        shapes.marked(after)
+        return longer.choices(block.span) == usual
+
+    assert not given_up(HOUR - 1)
+    return given_up
+
+
+class Numbered:
+    """A frame with a number."""
+
+    def __init__(self, transaction: int) -> None:
+        self.transaction = transaction
+
+
+def bridge_waits() -> Way:
+    bridge, device = Unanswered(), tcp_device()
+
+    def held(wait: float, now: float) -> None:
+        bridge.timed_out(device, Numbered(1), lambda _: None, now - wait)
+        bridge.answered(now - 0.01, now)
+
+    held(9.0, 100.0)
+    held(1.0, HOUR)
+    assert bridge.longest == 9.0
+
+    def given_up(after: float) -> bool:
+        held(1.0, 100.0 + after)
+        return bridge.longest == 1.0
+
+    return given_up
+
+
+def busy() -> Way:
+    rule, device = BusyDevices(), link_device()
+    poll = Poll(device, device.blocks[0], device.blocks[0].span)
+    for second in range(0, int(HOUR), 60):
+        rule.concluded(poll, BUSY, Traffic(), float(second), 0)
+    last = HOUR - 60
+    assert rule.free(device, last) > last
+
+    def given_up(after: float) -> bool:
+        assert rule.free(device, last + after) <= last + after  # it is polled
+        rule.concluded(poll, [0], Traffic(), last + after, 0)
+        return rule.free(device, last + after) <= last + after
+
+    return given_up
+
+
+def offline() -> Way:
+    health = link_device().health
+    for second in range(0, int(HOUR), 4):
+        health.unclear(SILENCE, None, float(second))
+        health.gave_up(float(second), 1 + PROBE_SPREAD)
+    last = HOUR - 4
+
+    def given_up(after: float) -> bool:
+        assert health.next_probe <= last + after + 1e-6
+        return health.answered() and health.online
+
+    return given_up
+
+
+def polls_until_online(rig: Rig, job: Any) -> None:
+    for _ in range(4):
+        if isinstance(job, Probe):
+            rig.conclude(job, Resynced(99))
+        elif isinstance(job, Settle):
+            rig.conclude(job, Settled(None))
+        else:
+            return
+        job = rig.next()
+
+
+def as_quick_as_before() -> Way:
+    health, now = link_device().health, HOUR
+    health.unclear(SILENCE, None, now)
+    health.gave_up(now, 1.0)
+    health.spoke(now + 0.25, 1.0)
+    return lambda _: health.patient and health.next_probe <= now + 0.25
+
+
+def kept_requests() -> Way:
+    rig = Rig(link_device())
+    rig.engine.inherits()
+    probe = rig.transacted()
+    rig.conclude(probe, Resynced(1))
+    polls_until_online(rig, rig.next())
+    return lambda _: not rig.engine._next_job.inherits and rig.device.state is State.ONLINE
+
+
+WAYS: dict[str, Callable[[], Way]] = {
+    "the adapter echoes": lambda: echo(first=ASKED + SAID, then=SAID),
+    "the adapter does not echo": lambda: echo(first=SAID, then=ASKED + SAID),
+    "turnaround": turnaround,
+    "a shorter silence is enough": shorter_silence,
+    "a silence is too short": silence_too_short,
+    "answers twice": answers_twice,
+    "takes one request at a time": one_at_a_time,
+    "refused address": refused_address,
+    "block too long": block_too_long,
+    "refuses monitor lists": monitor_list,
+    "refuses a longer read": longer_read,
+    "a bridge waits for a dead unit": bridge_waits,
+    "a device is busy": busy,
+    "a device is offline": offline,
+    "a device that returns is as quick as before": as_quick_as_before,
+    "earlier requests are kept": kept_requests,
+}
+
+
+@pytest.mark.parametrize("belief", BELIEFS, ids=lambda one: one.name)
+def test_a_belief_that_is_contradicted_is_given_up_in_time(belief: Belief) -> None:
+    given_up = WAYS[belief.name]()
+    assert given_up(belief.within)
+
+
+def test_every_belief_has_a_way_back() -> None:
+    assert WAYS.keys() == {belief.name for belief in BELIEFS}
+
+
+def test_damaged_replies_are_a_sign_of_life() -> None:
+    health = link_device().health
+    damaged = Garbled("wrong sum", b"x", evidence=Evidence.CHECKSUM)
+    for second in range(10):
+        health.unclear(damaged, None, float(second))
+        health.gave_up(float(second), 1.0)
+        assert health.next_probe < second + 0.1
+    health.unclear(SILENCE, None, 60.0)
+    health.gave_up(60.0, 1.0)
+    assert health.next_probe >= 61.0
