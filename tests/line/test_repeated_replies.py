@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.device.health import State
+from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.errors import LineDown, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
@@ -291,3 +292,34 @@ async def test_a_gateway_that_starts_takes_no_reply_to_an_earlier_process(
             server.flows.clear()
             await asyncio.sleep(draw.choice([draw.uniform(0.02, 0.4), draw.uniform(0.1, 3)]))
         assert wrong_values(line) == []
+
+
+@on_virtual_time
+async def test_a_monitor_list_is_not_used_while_a_station_answers_twice() -> None:
+    """All replies to a list have one shape: a copy would be the reply to the next read."""
+    driver = ComputerLink(station=1, monitor=True)
+    server = Repeater(after=0.03)
+    tags = numbered(driver, 100, 500, 900, 1300, every=0.1)
+    line, dev, memory = behind(server, driver, *tags)
+
+    def scan(at: float) -> int:
+        return int(at * 1000) & 0xFFFF
+
+    for tag in tags:
+        memory.animate("D", tag.span.start, scan)
+    async with running(line):
+        await asyncio.sleep(3)
+        assert any(block.listed for block in dev.blocks)
+        server.twice = set(range(server.replies, server.replies + 10_000, 7))
+        await asyncio.sleep(12)
+        assert not any(block.listed for block in dev.blocks)
+        assert dev.shapes is not None
+        assert dev.shapes.answers_twice
+        server.twice.clear()
+        dev.shapes.extra_at -= WARY_FOR  # as if the last one were so long ago
+        dev.monitor.again -= WARY_FOR
+        await asyncio.sleep(60)
+        assert any(block.listed for block in dev.blocks)
+    good = [(at, sample) for at, sample in line.reported if sample.quality is Quality.GOOD]
+    old = {at for at, sample in good if (scan(at) - int(str(sample.value))) % 65536 > 60}
+    assert len(old) <= 1, old

@@ -27,7 +27,12 @@ class MonitorList:
 
     def refused(self, now: float) -> None:
         """Forbids lists: a PLC that refuses its list is read without one for an hour."""
-        self.allowed, self.again = False, now + REFUSED_FOR
+        self.forbid(now + REFUSED_FOR)
+
+    def forbid(self, until: float) -> None:
+        """Forbids lists, at least until then."""
+        again = until if self.allowed else max(until, self.again)
+        self.allowed, self.again = False, again
 
     def allow(self) -> None:
         """Allows lists again."""

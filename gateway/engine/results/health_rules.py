@@ -4,6 +4,7 @@ import math
 
 from gateway.engine.device.device import ANSWERS_TWICE, Device
 from gateway.engine.device.health import Heard, State
+from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.effects import Effects
 from gateway.engine.results.staleness import Staleness
 from gateway.engine.schedule.schedule import Schedule
@@ -132,6 +133,10 @@ class HealthRules:
                 poll.forget(now)
                 self._effects.bad(poll.block.tags, Reason.GARBLED, time, why)
                 self._schedule.expedite(poll)
+        if any(block.listed for block in device.blocks):  # replies to one list are all alike
+            device.monitor.forbid(now + WARY_FOR)
+            device.plan()
+            self._schedule.plan(device, now)
 
     def outstanding_requests(self, device: Device) -> int:
         """Counts the requests to the device whose reply may still arrive.

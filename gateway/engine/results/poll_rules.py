@@ -68,7 +68,9 @@ class PollRules:
             self._learn(device, now)
 
     def _learn(self, device: Device, now: float) -> None:
-        """Compares the plan with the measured turnaround."""
+        """Compares the plan with the measured turnaround; allows lists again in their time."""
+        if device.monitor.again <= now:
+            self._replans.want(device, now)
         if device.bad_addresses.searching or (found := device.learn_turnaround()) is None:
             return
         self._replans.spent(device.planning_seconds(device.tags), now)
