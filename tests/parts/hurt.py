@@ -154,7 +154,7 @@ if __name__ == "__main__":
     for order in filter(None, orders.split(",")):
         HURT.order(order)
     setattr(service, "kinds", kinds)  # noqa: B010  (mypy: it is no export)
-    bulkheads.PAUSE_FIRST = 0.3  # seconds
+    bulkheads.PAUSE_FIRST = bulkheads.PAUSE_LONGEST = 0.3  # seconds
     sys.addaudithook(watched)
     stat = os.stat
 

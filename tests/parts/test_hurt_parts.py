@@ -153,26 +153,26 @@ def test_every_part_is_hurt() -> None:
     assert {*POINTS, *QUIET} == {*PARTS}
 
 
-async def test_each_part_fails_is_said_and_comes_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", POINTS)
+async def test_a_part_fails_is_said_and_comes_back(name: str, tmp_path: Path) -> None:
     async with running(tmp_path) as plant:
-        for name, points in POINTS.items():
-            for point in points:
-                first = len(plant.program.lines)
-                await plant.tell(f"break {name} {point}")
-                if point in RELOADED:
-                    await plant.reload()
-                else:
-                    await plant.until_said(name, f"broken in {point}")
-                await plant.until_stopped(name, f"broken in {point}", first)
-                await plant.works()
-                await plant.tell("mend")
-                await plant.until_said(name, "")
-            await plant.tell(f"break {name} make")
-            await plant.tell(f"break {name} run")
-            await plant.until_said(name, "broken in make")
+        for point in POINTS[name]:
+            first = len(plant.program.lines)
+            await plant.tell(f"break {name} {point}")
+            if point in RELOADED:
+                await plant.reload()
+            else:
+                await plant.until_said(name, f"broken in {point}")
+            await plant.until_stopped(name, f"broken in {point}", first)
             await plant.works()
             await plant.tell("mend")
             await plant.until_said(name, "")
+        await plant.tell(f"break {name} make")
+        await plant.tell(f"break {name} run")
+        await plant.until_said(name, "broken in make")
+        await plant.works()
+        await plant.tell("mend")
+        await plant.until_said(name, "")
         await plant.works()
 
 
