@@ -96,5 +96,5 @@ async def test_only_the_state_directory_is_written_and_systemd_is_told(
     found = {path.name for path in state.iterdir()} - {"copy.db"}
     [lock] = state.glob("gateway-*.lock")
     found -= {lock.name}
-    assert found == {"history.db", "history.db.lock", "state.json", "alarms.json"}
+    assert found == {"history.db", "history.db.lock", "state.json", "alarms.json", "audit.jsonl"}
     assert {path.name for path in tmp_path.iterdir()} == {"c.yaml", "confined.sh", "state"}
