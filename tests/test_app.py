@@ -56,7 +56,7 @@ class Watched:
             sample = self.latest(key)
             return sample is not None and sample.quality is Quality.GOOD
 
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while not all(good(key) for key in keys):
                 self._changed.clear()
                 await self._changed.wait()

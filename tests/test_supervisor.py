@@ -32,7 +32,7 @@ def heard(systemd: socket.socket) -> list[str]:
 
 
 async def hears(systemd: socket.socket, text: str) -> None:
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while text not in heard(systemd):
             await asyncio.sleep(0.005)
 

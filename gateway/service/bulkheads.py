@@ -41,7 +41,7 @@ log = structlog.get_logger("gateway")
 
 PAUSE_FIRST, PAUSE_LONGEST = 5.0, 300.0  # seconds
 WORKED = 600.0  # seconds: a part that worked so long begins with the first pause again
-CALL_WITHIN = 5.0  # seconds for `restore`, `begin` and `take_over`: the plant waits for them
+CALL_WITHIN = 5.0  # seconds for what the plant waits for: `restore`, `begin`, `take_over` …
 END_WITHIN = 1.0  # seconds
 
 T = TypeVar("T")
@@ -237,9 +237,7 @@ class Bulkheads:
 
     async def publish_all(self) -> None:
         for one in self._all:
-            if isinstance(one.part, Republishes):
-                with one:
-                    await one.part.publish_all()
+            await one.call(Republishes, lambda part: part.publish_all())
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         found: dict[str, Mapping[str, object]] = {}

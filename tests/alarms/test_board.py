@@ -225,7 +225,7 @@ async def test_each_change_is_on_disk_at_once(tmp_path: Path) -> None:
     path = tmp_path / "alarms.json"
     board = Board(AT_ONCE)
     file = AlarmFile(path, board.alarms)
-    async with file.kept(), asyncio.timeout(20):
+    async with file.kept(), asyncio.timeout(300):
         board.alarms.judge([good(AT_ONCE, 85, 5)])
         for state, change in (
             ("active", lambda: None),
@@ -270,7 +270,7 @@ async def test_a_disk_that_fails_is_a_fault_an_error_and_is_tried_again(
         [fault] = faults(document)
         assert fault.startswith("alarms not saved: ")
         in_the_way.rmdir()
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while file.trouble:
                 await asyncio.sleep(0.01)
         [status] = parse(orjson.loads(path.read_bytes())).values()

@@ -248,7 +248,7 @@ class _Latch:
         return self.reached and self.held >= self.delay
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(_STEPS, st.sampled_from([0.0, 2.5]))
 def test_any_course_of_values(steps: list[tuple[float, float | str]], delay: float) -> None:
     """Bad values hold everything, each change is a transition of the table, limits have their

@@ -48,7 +48,7 @@ class Writer:
 
     async def until(self, answer: str) -> None:
         """Signs writes until this is the answer."""
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(300):
             while await self.says(b"7", self.signed(b"7")) != answer:
                 await asyncio.sleep(0.05)
 

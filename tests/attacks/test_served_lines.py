@@ -43,7 +43,7 @@ class Wire:
         loop = asyncio.get_running_loop()
         os.write(self._master, request)
         reply = b""
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while len(reply) < size:
                 readable = asyncio.Event()
                 loop.add_reader(self._master, readable.set)
@@ -71,7 +71,7 @@ class Tcp:
     async def ask(self, pdu: str) -> str:
         data = b"\x01" + bytes.fromhex(pdu)
         self._writer.write(bytes(4) + len(data).to_bytes(2, "big") + data)
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             head = await self._reader.readexactly(6)
             reply = await self._reader.readexactly(int.from_bytes(head[4:], "big"))
         return reply[1:].hex(" ")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.e2e.paced_link import PacedLink, paced_link
-from tests.e2e.processes import Program, started, station, vigor_line, write_config
+from tests.e2e.processes import Program, slowed, started, station, vigor_line, write_config
 from tests.zenoh_peer import Reply, ZenohPeer, free_endpoint
 
 COUNT = 260
@@ -36,15 +36,15 @@ async def plant(folder: Path, endpoint: str) -> AsyncIterator[tuple[Program, Zen
 
 
 async def everything(client: ZenohPeer) -> list[Reply]:
-    return await client.get("plant/**", timeout=25, consolidation="NONE")
+    return await client.get("plant/**", timeout=slowed(25), consolidation="NONE")
 
 
 @asynccontextmanager
 async def asking(slow: ZenohPeer, link: PacedLink) -> AsyncIterator[asyncio.Task[Any]]:
     """Long answers are on their way over the link."""
-    answers = asyncio.create_task(slow.many([("plant/**", None)] * 16, 25))
+    answers = asyncio.create_task(slow.many([("plant/**", None)] * 16, slowed(25)))
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while not link.is_busy:
                 await asyncio.sleep(0.01)
         yield answers
@@ -74,9 +74,10 @@ async def test_answers_over_slow_links_are_whole(tmp_path: Path) -> None:
 
 # The command itself; the longest wait for a page is shorter, so that the test is.
 READ = """
+import sys
 import gateway.cli.client.client as client
 import gateway.cli.client.value_pages as pages
-client.REPLY_TIMEOUT, pages.PAGE_WITHIN = 3.5, 1.0
+client.REPLY_TIMEOUT, pages.PAGE_WITHIN = float(sys.argv.pop(1)), float(sys.argv.pop(1))
 from gateway.cli.main import main
 main()
 """
@@ -92,8 +93,9 @@ async def test_our_own_client_reads_more_than_arrives_in_the_time_of_one_query(
         paced_link(endpoint, rate=64_000) as radio,
     ):
         lines = {"hall": vigor_line("simulator", TAGS)}
+        times = slowed(3.5), slowed(1.0)
         far = write_config(tmp_path / "far.yaml", radio.endpoint, lines)
-        with Program(sys.executable, "-c", READ, "read", far, "--json") as read:
+        with Program(sys.executable, "-c", READ, *times, "read", far, "--json") as read:
             assert await asyncio.to_thread(read.ended) == 0
             rows = [json.loads(line) for line in read.lines]
             assert {row["tag"] for row in rows} == {f"mixer/{tag}" for tag in TAGS}
@@ -126,4 +128,4 @@ async def test_a_gateway_ends_at_once_beside_a_slow_link(tmp_path: Path) -> None
         ZenohPeer("client", connect=[radio.endpoint]) as slow,
         asking(slow, radio),
     ):
-        assert await asyncio.to_thread(program.end, signal.SIGTERM, 5) == 0
+        assert await asyncio.to_thread(program.end, signal.SIGTERM, slowed(5)) == 0

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.processes import ROOT, plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import PATIENCE, ROOT, plc_gateway, started, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -28,7 +28,7 @@ def printed_to(file: Path, *arguments: object) -> "subprocess.CompletedProcess[s
             stdout=out,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=20,
+            timeout=PATIENCE,
             check=False,
         )
 

@@ -51,7 +51,7 @@ class Page(NamedTuple):
         url = f"http://127.0.0.1:{self.port}{path}"
         request = urllib.request.Request(url, body, fields)
         try:
-            with urllib.request.urlopen(request, timeout=10) as reply:  # noqa: S310  (our own address)
+            with urllib.request.urlopen(request, timeout=300) as reply:  # noqa: S310  (our own address)
                 found = reply.status, reply.headers, reply.read()
         except urllib.error.HTTPError as error:
             with error:
@@ -152,7 +152,7 @@ def test_a_write_over_http_is_done_and_recorded_with_its_name(page: Page) -> Non
 def test_connections_that_send_nothing_close_the_page_to_nobody(page: Page) -> None:
     with ExitStack() as stack:
         idle = [
-            stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
+            stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=300))
             for _ in range(MOST_CONNECTIONS + 50)
         ]
         assert [page.ask(path)[0] for path in ("/healthz", "/readyz", "/metrics", "/")] == 4 * [200]

@@ -99,7 +99,7 @@ class PlayedGateway:
     def until_written(self, count: int) -> None:
         """Waits for so many writes."""
         with self._news:
-            assert self._news.wait_for(lambda: len(self.written) >= count, 20), self.written
+            assert self._news.wait_for(lambda: len(self.written) >= count, 300), self.written
 
     def _payload(self, key: str) -> tuple[str, str | None]:
         known = self.documents[key]

@@ -50,7 +50,7 @@ class Influx:
     def query(self, text: str) -> list[list[Any]]:
         """Returns the rows of an answer."""
         about = urllib.parse.urlencode({"q": text, "db": "plant"}).encode()
-        with urllib.request.urlopen(f"{self.url}/query", about, timeout=20) as answer:  # noqa: S310
+        with urllib.request.urlopen(f"{self.url}/query", about, timeout=300) as answer:  # noqa: S310
             [result] = json.load(answer)["results"]
         rows: list[list[Any]] = result.get("series", [{"values": []}])[0]["values"]
         return rows

@@ -53,7 +53,7 @@ class Client:
             "-t",
             f"plant/{topic}",
         )
-        subprocess.run([*command, "-m", payload, *options], check=True, timeout=20)
+        subprocess.run([*command, "-m", payload, *options], check=True, timeout=300)
 
     def retained(self, *topics: str) -> list[str]:
         """Returns the topics that the broker has a value of; the last must have one."""
@@ -69,7 +69,7 @@ class Client:
             "1",
             "-v",
         )
-        return subprocess.check_output([*command, *asked], text=True, timeout=20).split()
+        return subprocess.check_output([*command, *asked], text=True, timeout=300).split()
 
 
 def _is_seen(gateway: PlayedGateway, seen: Program) -> bool:

@@ -10,6 +10,7 @@ from gateway.cli.line.capture import Capture
 from gateway.config import LineConfig, load
 from gateway.errors import GatewayError
 from tests.conftest import needs
+from tests.e2e.processes import PATIENCE
 
 RTU = {"port": "/dev/ttyUSB0", "devices": {"plc": {"protocol": "modbus-rtu", "station": 3}}}
 TCP = {"port": "tcp://10.0.0.7:502", "devices": {"plc": {"protocol": "modbus-tcp", "station": 1}}}
@@ -36,7 +37,7 @@ def shown(folder: Path, line: object, *pieces: tuple[float, str, str]) -> list[l
         capture_output=True,
         text=True,
         check=True,
-        timeout=30,
+        timeout=PATIENCE,
     )
     return [row.split("\t") for row in done.stdout.splitlines()]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gateway.cli.progress import AFTER, progress
-from tests.e2e.processes import ROOT
+from tests.e2e.processes import PATIENCE, ROOT
 
 PLANT = """\
 zenoh: {listen: [tcp/127.0.0.1:7447]}
@@ -54,11 +54,15 @@ def test_a_long_check_shows_a_bar_and_removes_it(tmp_path: Path) -> None:
     os.close(far)
     shown = b""
     while b"%" not in shown:
-        shown += os.read(near, 1024)
+        try:
+            shown += os.read(near, 1024)
+        except OSError:
+            out, _ = program.communicate()
+            raise AssertionError(f"it ended with {program.returncode}: {shown!r} {out}") from None
     assert time.monotonic() - begun >= AFTER
     assert b"starting" in shown
     pipe.write_text("go on")
-    out, _ = program.communicate(timeout=20)
+    out, _ = program.communicate(timeout=PATIENCE)
     shown += _rest(near)
     assert program.returncode == 0
     assert f"{path}: good, 1 tag on 1 line" in out

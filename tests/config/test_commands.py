@@ -90,7 +90,7 @@ async def test_the_gateway_hands_commands_to_the_line(tmp_path: Path) -> None:
     with pytest.raises(LineDown):
         await gateway.control("oven", "model")
     tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while not gateway.lines[0].engine.is_open:
             await asyncio.sleep(0)
         said = await gateway.control("oven", "model")

@@ -22,6 +22,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def slowed(seconds: float) -> float:
+    """Returns the time that this machine, busy as it is now, takes for that of an idle one."""
+    return seconds * (1 + os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 class Done(NamedTuple):
     """The result of a program that ended by itself."""
 

@@ -68,5 +68,5 @@ async def test_the_time_without_a_gateway_is_a_gap(tmp_path: Path) -> None:
 
 def _http(port: int, period: str, bucket: str) -> Any:
     query = urllib.parse.urlencode({"tag": "mixer/speed", "time": period, "bucket": bucket})
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/history?{query}", timeout=10) as page:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/history?{query}", timeout=60) as page:
         return json.load(page)

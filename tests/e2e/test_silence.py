@@ -94,7 +94,7 @@ async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant
         heard.forget()
         alive.forget()
         plant.plc.tell("speak 1")
-        back = await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s), timeout=20)
+        back = await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s), timeout=300)
         assert back.json["value"] > last_good.json["value"]
         await heard.next(lambda s: s.key == "plant/mixer/fault" and _good(s))
         came = await alive.next(lambda t: t.kind == "PUT")

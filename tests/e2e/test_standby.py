@@ -77,7 +77,7 @@ def gateway(folder: Path, name: str, router: str, port: int, listen: Sequence[st
 
 async def until_states(client: ZenohPeer, stands: str) -> None:
     """Waits until a and b report these states; their documents lag a little."""
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(300):
         while True:
             replies = await client.get("plant/@gateway/*/standby")
             found = {reply.key: reply.json["stand"] for reply in replies if reply.key}

@@ -40,7 +40,7 @@ def load_of(file: Path) -> float:
 
 async def test_a_value_is_carried_and_its_row_goes_on_over_a_reload(tmp_path: Path) -> None:
     endpoint, file = free_endpoint(), tmp_path / "c.yaml"
-    first = {"from": "mixer/speed", "to": "oven/setpoint", "scale": 10}
+    first = {"from": "mixer/speed", "to": "oven/setpoint", "scale": 10, "stale": "1h"}
     write_config(file, endpoint, lines(), transfers=[first])
     program = started(file)
     with program:

@@ -277,7 +277,7 @@ _CHOICE = st.sampled_from(["M0", "M40", "S7", "D5", "D90", "D91", "X20"])
     orders=st.lists(st.tuples(_CHOICE, st.integers(0, 1)), min_size=1, max_size=40),
     holes=st.sets(_CHOICE, max_size=1),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_device_gets_all_its_requests_in_their_order(
     orders: list[tuple[str, int]], holes: set[str]
 ) -> None:

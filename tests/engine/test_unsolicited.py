@@ -710,7 +710,7 @@ async def test_listening_begins_again_when_the_port_was_lost_and_reopened() -> N
 @pytest.mark.parametrize(
     "name", ["scale", "barcode-reader", "inverter", "weighing-machine", "vb-1com"]
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     pieces=st.lists(
         st.tuples(

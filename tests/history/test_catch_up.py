@@ -28,7 +28,7 @@ from tests.history.recorded import record_outcome
 from tests.history_writer import WEEK, until
 from tests.northbound.plant import PlainDevice, PlainPlant, northbound_of, tag
 from tests.test_docs import bare, table
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import TIMEOUT, ZenohPeer, free_endpoint
 
 T = TypeVar("T")
 EXAMPLE = Path(__file__).parents[2] / "examples" / "catch_up.py"
@@ -67,12 +67,12 @@ async def serving(
     northbound = northbound_of(below, settings, history=historian)
     serves = asyncio.create_task(northbound.run())
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             await northbound.opened.wait()
         yield northbound
     finally:
         serves.cancel()
-        await asyncio.wait([serves], timeout=5)
+        await asyncio.wait([serves], timeout=TIMEOUT)
 
 
 async def test_history_is_answered_by_zenohs_time_ranges(tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ async def test_outcomes_of_writes_and_commands_are_queried_by_time(tmp_path: Pat
     ):
         for outcome in done:
             record_outcome(historian, outcome)
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while historian.document()["writes_stored"] != len(done):
                 await asyncio.sleep(0.01)
 
@@ -302,7 +302,7 @@ class Consumer:
             self._arrived.set()
 
     async def knows(self, value: int) -> None:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(300):
             while not any(line.endswith(f"speed {value}") for line in self.lines[-500:]):
                 self._arrived.clear()
                 await self._arrived.wait()

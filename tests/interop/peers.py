@@ -19,7 +19,7 @@ async def running(*command: str | Path, ready: bytes) -> AsyncIterator[Process]:
     assert process.stdout is not None
     try:
         heard = b""
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(300):
             while ready not in heard:
                 line = await process.stdout.readline()
                 heard += line
@@ -36,7 +36,7 @@ async def finished(*command: str | Path) -> str:
     process = await asyncio.create_subprocess_exec(
         *map(str, command), stdout=PIPE, stderr=PIPE, cwd=HERE
     )
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(300):
         out, err = await process.communicate()
     assert process.returncode == 0, f"{out.decode()}{err.decode()}"
     return out.decode()

@@ -126,7 +126,7 @@ def expected(text: str) -> int | bool:
 
 async def _write_and_read(line: Plant, device: Device, text: str, value: int) -> None:
     tag = next(tag for tag in device.tags if tag.text == text)
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         result = await line.line.write(device, tag, tag.encode(value))
     assert result.verified
     await until(lambda: line.now[tag].value == value)
@@ -139,7 +139,7 @@ async def _write_group(line: Plant, device: Device, texts: list[str], function: 
     values = [n % 2 == 0 if bits else 3 * n for n in range(len(tags))]
     begin = len(line.bench.sent)
     pairs = zip(tags, values, strict=True)
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         ends = line.line.write_group(device, [(tag, tag.encode(value)) for tag, value in pairs])
         results = await asyncio.gather(*ends)
     assert all(result.verified for result in results)
@@ -158,7 +158,7 @@ def _function(device: Device, data: bytes) -> int:
 
 
 async def until(happened: Callable[[], bool]) -> None:
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while not happened():
             await asyncio.sleep(0.01)
 

@@ -105,7 +105,7 @@ async def test_a_caller_is_answered_and_its_hang_up_is_the_end_of_the_call() -> 
 
 async def connected(bench: Bench, say: Callable[[], None]) -> None:
     """Repeats a request until the modem has answered the call and passes it on."""
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(300):
         while not bench.receiver.data.endswith(READ):
             say()
             await asyncio.sleep(0.2)

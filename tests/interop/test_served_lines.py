@@ -57,7 +57,7 @@ async def serving(port: str, protocol: str) -> AsyncIterator[Plant]:
     line = ServedLine(config, plant, sample_of)
     task = asyncio.create_task(line.run())
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while not line.is_open:
                 await asyncio.sleep(0)
         yield plant

@@ -23,7 +23,7 @@ from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
 from tests.tag_settings import grouped
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import TIMEOUT, ZenohPeer, free_endpoint
 
 
 def tag(device: str, name: str, **settings: Any) -> Tag:
@@ -238,7 +238,7 @@ async def running(northbound: Northbound) -> AsyncIterator[Northbound]:
     """Runs it until everything is declared, or until it fails; stops it at the end."""
     serves = asyncio.create_task(northbound.run())
     opens = asyncio.create_task(northbound.opened.wait())
-    await asyncio.wait([serves, opens], return_when=asyncio.FIRST_COMPLETED, timeout=5)
+    await asyncio.wait([serves, opens], return_when=asyncio.FIRST_COMPLETED, timeout=TIMEOUT)
     try:
         if serves.done():
             serves.result()
@@ -246,7 +246,7 @@ async def running(northbound: Northbound) -> AsyncIterator[Northbound]:
     finally:
         opens.cancel()
         serves.cancel()
-        await asyncio.wait([serves], timeout=5)
+        await asyncio.wait([serves], timeout=TIMEOUT)
         assert serves.done()
 
 
@@ -268,6 +268,6 @@ def has_value(key: str, value: Value | None) -> Any:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while not condition():
             await asyncio.sleep(0.005)

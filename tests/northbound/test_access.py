@@ -43,7 +43,7 @@ async def test_behind_a_router_a_second_gateway_leaves_the_devices_to_the_first(
         )
         second = northbound_of(mixer(), settings, name="second")
         serves = asyncio.create_task(second.run())
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             await second.replaced.wait()
         assert second.withheld == {"mixer": "demo", "oven": "demo"}
         assert not second.active.is_set()

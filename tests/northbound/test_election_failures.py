@@ -167,7 +167,7 @@ EVENTS = st.lists(
 )
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(
     count=st.integers(2, 3),
     seed=st.integers(0, 2**32),

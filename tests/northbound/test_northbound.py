@@ -14,6 +14,7 @@ from gateway.errors import (
     ConfigError,
     GatewayError,
 )
+from tests.e2e.processes import slowed
 from tests.northbound.plant import (
     gateway_and_client,
     mixer,
@@ -53,7 +54,7 @@ async def gateway_process(endpoint: str, fails: str = "") -> asyncio.subprocess.
         stderr=asyncio.subprocess.PIPE,
     )
     assert process.stdout is not None
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while b"serving" not in await process.stdout.readline():
             pass
     return process
@@ -69,7 +70,7 @@ async def test_the_token_of_a_killed_gateway_ends_within_its_lease() -> None:
         process = await gateway_process(endpoint)
         await live.next(lambda token: token.kind == "PUT")
         process.kill()
-        await live.next(lambda token: token.kind == "DELETE", timeout=3.0)
+        await live.next(lambda token: token.kind == "DELETE", timeout=slowed(3.0))
         await process.communicate()
 
 
@@ -78,7 +79,7 @@ async def test_a_failing_process_closes_the_session_and_ends(fails: str) -> None
     endpoint = free_endpoint()
     async with ZenohPeer("router", listen=[endpoint]):
         process = await gateway_process(endpoint, fails)
-        async with asyncio.timeout(4):
+        async with asyncio.timeout(slowed(4)):
             _, errors = await process.communicate()
         assert process.returncode == 1
         assert (b"the loop went wrong" in errors) == (fails == "loop")

@@ -26,7 +26,7 @@ from tests.northbound.plant import (
     tag,
 )
 from tests.sim.virtual import now, on_virtual_time
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import TIMEOUT, ZenohPeer, free_endpoint
 
 
 @pytest.mark.parametrize("event", [False, True])
@@ -107,12 +107,12 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
             live.forget()
             northbound.publish([plant.now("mixer/speed", 2)])  # no link: it reaches no subscriber
             async with ZenohPeer("router", listen=[endpoint]):
-                await received.next(has_value("plant/mixer/speed", 2), timeout=15)
+                await received.next(has_value("plant/mixer/speed", 2), timeout=TIMEOUT)
                 await received.until(lambda of: len(of.latest()) == 4)
                 await live.next(lambda token: token.kind == "PUT")
     finally:
         serves.cancel()
-        await asyncio.wait([serves], timeout=5)
+        await asyncio.wait([serves], timeout=TIMEOUT)
 
 
 async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> None:

@@ -78,7 +78,7 @@ def test_a_file_that_is_no_zenoh_configuration_is_refused(tmp_path: Path, text: 
 async def test_a_client_starts_while_its_first_router_is_down() -> None:
     absent, there = free_endpoint(), free_endpoint()
     config = configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(absent, there)))
-    async with ZenohPeer("router", listen=[there]), asyncio.timeout(60):
+    async with ZenohPeer("router", listen=[there]), asyncio.timeout(300):
         session = await open_session(config, retry=True)
         try:
             assert len(session.info.routers_zid()) == 1

@@ -34,7 +34,7 @@ async def served(gateway: Plant, until: str) -> None:
     """Runs the one line until the document of the device shows this standing."""
     line, device = only(gateway)
     task = asyncio.create_task(line.run())
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while standing(device) != until:
             await asyncio.sleep(0)
     task.cancel()

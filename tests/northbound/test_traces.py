@@ -15,7 +15,7 @@ KEY = "plant/@gateway/demo/lines/hall/@trace"
 
 
 async def _until(active: bool, log: object) -> None:
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(300):
         while log.active is not active:  # type: ignore[attr-defined]
             await asyncio.sleep(0.001)
 

@@ -69,7 +69,7 @@ def bad_numbers(found: Device) -> set[int]:
     return {span.start for span in found.bad_addresses.bad}
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.sets(st.integers(0, 63), min_size=1), st.sets(st.integers(0, 63), max_size=6))
 def test_any_set_of_bad_addresses_is_found(numbers: set[int], missing: set[int]) -> None:
     """Bad tags are named, holes in gaps are planned around, all other tags are read."""
@@ -82,7 +82,7 @@ def test_any_set_of_bad_addresses_is_found(numbers: set[int], missing: set[int])
     assert {tag for b in found.blocks for tag in b.tags} == set(found.tags)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.sets(st.integers(0, 63), max_size=5))
 def test_neighbours_of_bad_addresses_stay_in_one_block(missing: set[int]) -> None:
     """With every address in use: one block for each run between two culprits, no more."""
@@ -93,7 +93,7 @@ def test_neighbours_of_bad_addresses_stay_in_one_block(missing: set[int]) -> Non
     assert [block.span.size for block in good] == [len(run) for run in runs]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.sets(st.integers(0, 63), min_size=1, max_size=6))
 def test_the_search_takes_about_two_log_n_transactions_for_each_bad_address(
     missing: set[int],
@@ -105,7 +105,7 @@ def test_the_search_takes_about_two_log_n_transactions_for_each_bad_address(
     assert asker.exchanges <= 1 + 2 * len(missing) * math.ceil(math.log2(64))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.sets(st.integers(0, 40), min_size=1, max_size=6),
     st.lists(st.integers(0, 40), min_size=1, max_size=6),

@@ -80,7 +80,7 @@ def rows(draw: st.DrawFn) -> Row:
     return row
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     rows(),
     st.data(),
@@ -99,7 +99,7 @@ def test_no_set_of_requests_costs_less(
     assert spent(found, seconds) == pytest.approx(brute_force(intervals, seconds), rel=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 4), st.sampled_from([0.5, 1.0, 5.0])), max_size=40))
 def test_even_costs_give_the_same_result_faster(steps: list[tuple[int, float]]) -> None:
     row, at = [], 0

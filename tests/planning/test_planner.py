@@ -90,7 +90,7 @@ def brute_force(area: str, tags: Sequence[Tag], seconds: partial[float], cuts: C
     return best
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.one_of(st.lists(words, min_size=1, max_size=9), st.lists(bits, min_size=1, max_size=9)),
     bauds,
@@ -106,7 +106,7 @@ def test_no_plan_of_one_interval_costs_less(
     assert total(blocks, seconds) == pytest.approx(brute_force(area, tags, seconds, cuts))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(mixed, max_size=40), bauds, st.sets(st.integers(0, 300), max_size=4))
 def test_every_tag_is_read_once_within_the_limits_and_often_enough(
     tags: list[Tag], baud: int, fences: set[int]
@@ -124,7 +124,7 @@ def test_every_tag_is_read_once_within_the_limits_and_often_enough(
             assert tag.span.start + tag.span.size <= block.span.start + block.span.size
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(mixed, max_size=25), st.randoms(use_true_random=False))
 def test_the_plan_does_not_depend_on_the_order_of_the_tags(tags: list[Tag], chance: object) -> None:
     tags = list({(tag.text, tag.every): tag for tag in tags}.values())
@@ -134,7 +134,7 @@ def test_the_plan_does_not_depend_on_the_order_of_the_tags(tags: list[Tag], chan
     assert [(b.span, b.every, b.cost) for b in first] == [(b.span, b.every, b.cost) for b in second]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.sets(st.integers(0, 60), min_size=1, max_size=20), st.sets(st.integers(0, 61), max_size=5)
 )

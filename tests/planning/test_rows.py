@@ -139,7 +139,7 @@ addresses = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(addresses, st.sampled_from([0.2, 1.0, 10.0])), max_size=30),
     st.lists(st.tuples(st.sampled_from([0, 0, 8, 100]), st.integers(1, 3)), max_size=5),

@@ -571,7 +571,7 @@ CONVERSATIONS: list[Converse] = [
 ]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(st.one_of(BLOCKS, st.binary(max_size=8)), max_size=4),
     st.sampled_from(CONVERSATIONS),

@@ -170,7 +170,7 @@ noise = st.lists(
 ).map(bytes)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(procedures, st.lists(st.tuples(noise, answers), max_size=4), st.lists(st.integers(1, 9)))
 def test_blocks_survive_noise_and_any_chopping(
     procedure: Procedure, parts: list[tuple[bytes, Frame]], cuts: list[int]
@@ -209,7 +209,7 @@ line_bytes = st.lists(
 ).map(b"".join)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(procedures, line_bytes)
 @example((4, True), b"\x0605FF\r\r\n")
 @example((1, True), b"\x0205FF\x03\r")

@@ -70,7 +70,7 @@ def values(data: st.DataObject, driver: ComputerLink, span: Span) -> list[int]:
     return data.draw(st.lists(st.integers(0, top), min_size=span.size, max_size=span.size))
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(st.data(), drivers, st.integers(1, 7))
 async def test_a_read_returns_the_devices_at_exactly_its_cost(
     data: st.DataObject, driver: ComputerLink, pieces: int
@@ -90,7 +90,7 @@ async def test_a_read_returns_the_devices_at_exactly_its_cost(
     assert peer.confirmed == driver.send_area_c
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(st.data(), drivers)
 async def test_a_write_changes_only_its_devices_at_exactly_its_cost(
     data: st.DataObject, driver: ComputerLink
@@ -109,7 +109,7 @@ async def test_a_write_changes_only_its_devices_at_exactly_its_cost(
     assert wire.cost == cost
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(st.data(), drivers)
 async def test_a_scattered_write_changes_its_devices_and_no_other(
     data: st.DataObject, driver: ComputerLink
@@ -130,7 +130,7 @@ async def test_a_scattered_write_changes_its_devices_and_no_other(
     assert wire.cost == cost
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(st.data(), drivers)
 async def test_registered_devices_are_read_in_their_order(
     data: st.DataObject, driver: ComputerLink
@@ -155,7 +155,7 @@ async def test_registered_devices_are_read_in_their_order(
     assert wire.cost == cost
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data(), drivers)
 def test_if_a_span_is_too_long_no_longer_one_is_not(
     data: st.DataObject, driver: ComputerLink

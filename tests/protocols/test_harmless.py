@@ -29,7 +29,7 @@ async def resynced(
     return told, length, wire.sent[0]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.sampled_from(DRIVERS),
     st.lists(st.tuples(st.integers(0, 3000), st.integers(1, 30)), max_size=4),
@@ -53,7 +53,7 @@ async def test_a_resync_is_told_from_as_many_requests_as_it_says(
         lengths.append(length)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.sampled_from(DRIVERS[:2]),
     st.lists(st.tuples(st.integers(0, 3000), st.integers(1, 30)), min_size=1, max_size=4),

@@ -67,7 +67,7 @@ class Plant:
         return [sample for sample in self.published if sample.tag.key == key]
 
     async def until_good(self, *keys: str) -> None:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(300):
             while any(self.sample(key).quality is not Quality.GOOD for key in keys):
                 await asyncio.sleep(0.001)
 

@@ -168,7 +168,7 @@ def test_the_stations_of_a_line_have_one_format() -> None:
         Bench("/dev/ttyS98", devices)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.one_of(st.binary(max_size=16), st.sampled_from([b"\x05", b"05FF", b"WW0", b"02"]))),
     st.sampled_from([1, 4]),
@@ -182,7 +182,7 @@ def test_any_bytes_write_nothing(pieces: list[bytes], frame_format: int) -> None
     assert made.ask(read)[:9] == b"\x0205FF1234"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 20), st.integers(1, 255))
 def test_a_damaged_write_is_never_done(place: int, flip: int) -> None:
     made, damaged = bench(4), bytearray(request("05FFWW0D0500011234", 4))

@@ -226,7 +226,7 @@ def test_an_ex485lnk_gets_10_ms_of_silence() -> None:
     assert Bench("/dev/ttyS98", {"plc": plc}).hear(READ).delay == 0.002
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.binary(max_size=20), st.sampled_from([0.0, 0.001, 0.01, 1.0]))))
 def test_any_bytes_at_any_time_are_answered_only_where_a_sound_request_is(
     pieces: list[tuple[bytes, float]],
@@ -253,7 +253,7 @@ def _begins_with_another(frame: bytes) -> bool:
     return any(crc16(frame[: size - 2]) == frame[size - 2 : size] for size in range(4, len(frame)))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(_frames(), min_size=1, max_size=6), st.integers(1, 9))
 def test_frames_are_found_however_they_are_cut(frames: list[bytes], size: int) -> None:
     wire = bench().line.machine()._wire  # type: ignore[attr-defined]

@@ -178,7 +178,7 @@ def test_bytes_that_are_no_modbus_end_the_connection() -> None:
     assert heard.reply == b""
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.binary(max_size=40), max_size=8), st.binary(max_size=12))
 def test_any_bytes_write_nothing_outside_accept(pieces: list[bytes], pdu: bytes) -> None:
     made = bench()

@@ -132,7 +132,7 @@ def test_a_request_that_another_follows_is_neither_done_nor_answered() -> None:
     assert made.line.stale == 2
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.one_of(st.binary(max_size=16), st.sampled_from([b"\x0202", b"\x03", b"61"]))))
 def test_any_bytes_write_nothing(pieces: list[bytes]) -> None:
     made = bench()
@@ -143,7 +143,7 @@ def test_any_bytes_write_nothing(pieces: list[bytes]) -> None:
     assert ask(made, 5, "51", "1C1402") == "00E803"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 14), st.integers(1, 255))
 def test_a_damaged_write_is_never_done(place: int, flip: int) -> None:
     made, damaged = bench(), bytearray(frame(2, "61", "1C0004FEFFFFFF"))

@@ -413,7 +413,7 @@ pieces_of_line = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(pieces_of_line, st.sampled_from(PROCEDURES), st.sampled_from(["liyan", "fx"]))
 def test_after_any_bytes_the_next_request_gets_its_reply(
     pieces: list[bytes], procedure: Procedure, profile: ProfileName

@@ -183,7 +183,7 @@ def test_k120s_relays_are_words_and_bits_at_once() -> None:
     assert ask(station, bytes.fromhex("0110100010")) == bytes.fromhex("01020400")
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.sampled_from(KINDS),
     st.integers(0, 65535),
@@ -211,7 +211,7 @@ def test_pymodbus_reads_back_its_own_writes(
     assert list(read.bits)[: len(bits)] == bits
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.sampled_from(KINDS), st.sampled_from(["plain", "vigor", "k120s", "ex485lnk"]), st.data())
 async def test_driver_and_station_agree_on_where_everything_is(
     kind: type, dialect: Any, data: st.DataObject
@@ -236,7 +236,7 @@ async def test_driver_and_station_agree_on_where_everything_is(
     assert list(await driver.read(talk, span)) == units
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(sorted(FRAMINGS.values())), st.lists(st.binary(max_size=30), max_size=6))
 def test_any_bytes_are_answered_or_passed_over(framing: Any, pieces: list[bytes]) -> None:
     station = ModbusStation(framing=framing)
@@ -244,7 +244,7 @@ def test_any_bytes_are_answered_or_passed_over(framing: Any, pieces: list[bytes]
         assert all(station.hear(piece, 0.0))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.binary(min_size=1, max_size=30), st.sampled_from(["plain", "vigor", "k120s"]))
 def test_any_request_is_answered_or_refused(pdu: bytes, dialect: Any) -> None:
     station, codec = ModbusStation(framing="tcp", dialect=dialect), ModbusTcp().codec()

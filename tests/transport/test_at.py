@@ -247,7 +247,7 @@ def test_the_end_of_a_frame_is_dropped_with_the_carrier() -> None:
     assert bench.data == b"VALUE=12"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.binary(max_size=12) | st.sampled_from([b"\r", b"\r\n", b"\r\nNO", LOST[:-1]])))
 def test_all_other_data_passes_unchanged(pieces: list[bytes]) -> None:
     bench = Bench()
@@ -262,7 +262,7 @@ def test_all_other_data_passes_unchanged(pieces: list[bytes]) -> None:
     assert bench.data == sent
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.binary(max_size=20) | st.sampled_from([b"\r\nOK\r\n", b"BUSY\r", b"RING\r\n"])))
 def test_any_bytes_lead_to_a_state_in_which_it_can_be_opened(pieces: list[bytes]) -> None:
     bench = Bench()

@@ -155,7 +155,7 @@ class Client:
         reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
         try:
             writer.write("\r\n".join(lines).encode() + body)
-            whole = await asyncio.wait_for(reader.read(), 60)
+            whole = await asyncio.wait_for(reader.read(), 300)
         finally:
             writer.close()
             await writer.wait_closed()
