@@ -139,8 +139,9 @@ class Engine:
         if in_flight.continuation is None:
             in_flight.ended(now, shared=len(self.devices) > 1)
         effects, self._effects.collected = self._effects.collected, []
-        if len(effects) != 1 or self.deadline <= now:  # a good read alone changes no deadline
-            self._set_deadline()
+        good = isinstance(job, Poll) and not isinstance(result, Exception)
+        if not good or len(effects) != 1 or self.deadline <= now:
+            self._set_deadline()  # a good read alone changes none
         return effects
 
     def _count(self, device: Device, traffic: Traffic, now: float) -> None:

@@ -4,7 +4,11 @@ import asyncio
 
 from gateway.engine.device.ages import polled_blocks, worst_ages
 from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.jobs.jobs import Poll
+from gateway.errors import NoReply
 from gateway.tags import Quality, Reason
+from tests.engine.rig import Rig
 from tests.sim.plant import Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
 
@@ -92,3 +96,37 @@ async def test_a_device_that_is_written_all_the_time_is_polled_like_the_others()
         min(poll.reads.count for poll in line.line.engine.schedule.polls(dev)) for dev in devices
     ]
     assert min(reads) > 0.6 * max(reads)
+
+
+def expire(rig: Rig) -> Reason | None:
+    """Lets the deadlines of a minute pass. Returns the reason of the last bad value."""
+    until = rig.now + 60.0
+    while rig.engine.deadline <= until:
+        rig.now = rig.engine.deadline
+        rig.note(rig.engine.expire(rig.now, rig.time))
+    return rig.samples[-1].reason
+
+
+def read(rig: Rig) -> None:
+    poll = rig.transacted()
+    assert isinstance(poll, Poll)
+    rig.conclude(poll, [0] * len(poll.block.tags))
+    assert rig.samples[-1].reason is None
+
+
+def test_values_that_all_turned_overdue_at_once_do_so_again() -> None:
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    for _ in range(3):
+        read(rig)
+        assert expire(rig) is Reason.OVERDUE
+
+
+def test_a_poll_that_fails_brings_the_deadline_of_its_values() -> None:
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    read(rig)
+    poll = rig.transacted()
+    assert isinstance(poll, Poll)
+    rig.conclude(poll, NoReply("no reply"))
+    assert rig.engine.deadline <= rig.now + 2 * poll.block.every

@@ -50,12 +50,11 @@ class Staleness(Rule):
         """Turns values bad that are too old."""
         self.due = NEVER
         for poll, limit in self._limits():
-            if poll.reads.at is None:
-                self.due = min(self.due, now + limit)
-            elif poll.reads.at + limit > now:
-                self.due = min(self.due, poll.reads.at + limit)
-            else:
+            at = poll.reads.at
+            if at is not None and at + limit <= now:
                 self._turn_bad(poll, now, time)
+                at = None
+            self.due = min(self.due, (now if at is None else at) + limit)  # it may be read soon
 
     def _limits(self) -> Iterator[tuple[PollEntry, float]]:
         """Yields the age limit of each poll of an online device; other values are bad already."""
