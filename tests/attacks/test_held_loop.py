@@ -50,6 +50,7 @@ async def test_all_tokens_end_while_the_loop_stands_still_and_the_gateway_starts
             live = [await client.liveliness(f"plant/{key}") for key in TOKENS]
             for token in live:
                 await token.next(is_kind("PUT"))
+            await asyncio.to_thread(gateway.says, "Zenoh session ready")
             os.kill(gateway.pid, signal.SIGUSR1)
             for token in live:
                 await token.next(is_kind("DELETE"))
