@@ -30,7 +30,7 @@ from gateway.config import (
 from gateway.config.commands import TO_ALL, every_command
 from gateway.config.settings.sections import part_sections
 from gateway.config.yaml.file import read_yaml
-from gateway.contract import payload
+from gateway.contract import certificates, payload
 from gateway.contract.keys import Keys
 from gateway.contract.meta import meta
 from gateway.contract.payload import Problem
@@ -38,7 +38,6 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.line.send_permit import Duty
 from gateway.northbound.group.standby import GroupSettings, Standby
 from gateway.northbound.session.exposures import exposures
-from gateway.parts.certificates.part import certificate_document
 from gateway.parts.history.historian import Historian
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
@@ -675,7 +674,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
         found = dict(line.split(maxsplit=1) for line in asking.lines)
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
     known |= Standby(GroupSettings("hall"), None, Keys("plant", "demo"), Duty()).documents()
-    known["certificates/"] = certificate_document(tmp_path, 0.0, 0.0)
+    known["certificates/"] = certificates.document(tmp_path, 0.0, 0.0)
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)

@@ -5,11 +5,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from pathlib import Path
 
 from gateway import files
 from gateway.config import TlsConfig
-from gateway.contract.faults import certificate_fault
+from gateway.contract.faults import Document, certificate_fault
 from gateway.errors import ConfigError
+from gateway.tags.timestamps import rfc3339
 
 DAY = 86_400
 _UTC_TIME, _VERSION = 0x17, 0xA0  # tags of ASN.1
@@ -36,9 +38,19 @@ def expiries(tls: TlsConfig) -> list[str]:
         if file is not None:
             with _as_config_error(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
                 at = expires(files.read(file, files.MOST_OF_SECRETS), last=name == "ca")
-            document = {"file": str(file), "days": (at - time.time()) / DAY, "trouble": ""}
-            found += [certificate_fault(f"zenoh.tls.{name}", document)]
+            found += [certificate_fault(f"zenoh.tls.{name}", document(file, at, time.time()))]
     return [one for one in found if one]
+
+
+def document(file: Path, found: float | str, now: float) -> Document:
+    """Returns the status document of a certificate.
+
+    `found`: when it expires, or why that is unknown. Times in seconds since 1970.
+    """
+    if isinstance(found, str):
+        return {"file": str(file), "expires": None, "days": None, "trouble": found}
+    at, days = rfc3339(int(found * 1e9)), round((found - now) / DAY, 1)
+    return {"file": str(file), "expires": at, "days": days, "trouble": ""}
 
 
 def expires(content: bytes, *, last: bool = False) -> float:

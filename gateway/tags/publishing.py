@@ -1,4 +1,4 @@
-"""How values are published and stored: on a change, at an interval, in which form."""
+"""Publishing of values: on a change or at an interval, and in which form."""
 
 from dataclasses import dataclass
 from enum import StrEnum

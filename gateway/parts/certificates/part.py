@@ -5,20 +5,17 @@ import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from gateway import files
 from gateway.config import Config, TlsConfig
-from gateway.contract.certificates import check_files, expires
+from gateway.contract.certificates import check_files, document, expires
 from gateway.errors import ConfigError
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.plant.threads import off_loop
 from gateway.tags import Tag
-from gateway.tags.timestamps import rfc3339
 
 LOOK_EVERY = 3600.0  # seconds
 LOOK_WITHIN = 4.0  # seconds: a file system may hang
-DAY = 86_400
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +58,7 @@ class CertificatePart:
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         now = time.time()
         return {
-            f"certificates/{setting}": certificate_document(getattr(self._tls, setting), found, now)
+            f"certificates/{setting}": document(getattr(self._tls, setting), found, now)
             for setting, found in self._looked.expires.items()
         }
 
@@ -86,14 +83,6 @@ def _look(tls: TlsConfig) -> Looked:
     except ConfigError as error:
         return Looked(digest.digest(), found, str(error))
     return Looked(digest.digest(), found, "")
-
-
-def certificate_document(file: Path, found: float | str, now: float) -> Mapping[str, object]:
-    if isinstance(found, str):
-        return {"file": str(file), "expires": None, "days": None, "trouble": found}
-    days = (found - now) / DAY
-    at = rfc3339(int(found * 1e9))
-    return {"file": str(file), "expires": at, "days": round(days, 1), "trouble": ""}
 
 
 def _make(core: Core) -> Part | None:
