@@ -32,6 +32,10 @@ async def plant(folder: Path, endpoint: str) -> AsyncIterator[tuple[Program, Zen
                 await beside.until_alive(
                     "plant/@gateway/*/alive/*", ["plant/@gateway/demo/alive/mixer"]
                 )
+                while not all(
+                    reply.json["quality"] == "good" for reply in await beside.get("plant/mixer/*")
+                ):
+                    await asyncio.sleep(0.05)  # until each block was read once
                 yield program, beside
 
 
