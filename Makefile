@@ -34,6 +34,7 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.transactions
 	$(BIN)/python -m benchmarks.overload
 	$(BIN)/python -m benchmarks.planning
+	$(BIN)/python -m benchmarks.noise
 	$(BIN)/python -m benchmarks.start
 	$(BIN)/python -m benchmarks.commands
 	$(BIN)/python -m benchmarks.northbound

@@ -36,6 +36,11 @@ TINY = [
     ),
     ("moves", "", [r"^poll +\d+ files entered, +\d+ moves", r"^write +\d+ files entered"]),
     (
+        "noise",
+        "--seconds 1 --protocols Vigor --losses 25",
+        [r"^\| Vigor \| 8 \| 25 % \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| 0 \|$"],
+    ),
+    (
         "northbound",
         "--tags 200 --devices 2 --seconds 0.1 --flood 0.1",
         [

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from gateway.engine.device.device import ECHO_PROVEN_FOR
-from gateway.engine.device.health import PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.health import ALIVE_FOR, PROBE_PAUSE, PROBE_SPREAD
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
 from gateway.engine.device.reply_shapes import WARY_FOR
@@ -126,6 +126,13 @@ BELIEFS = (
         "a reply to a probe",
         "it is polled",
         PROBE_PAUSE * (1 + PROBE_SPREAD),
+    ),
+    Belief(
+        "noise destroys its replies",
+        "damaged replies in the last 10 s, and no late one for a minute",
+        "a late reply, or no damaged one",
+        "it is waited for late replies again, and resyncs are patient",
+        ALIVE_FOR,
     ),
     Belief(
         "a device that returns is as quick as before",

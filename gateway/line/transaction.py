@@ -14,6 +14,8 @@ from gateway.protocols.driver import Codec, EndedByGap
 
 T = TypeVar("T")
 MOST_REMEMBERED = 4096  # bytes of one reply
+GAP = 0.02  # seconds without a byte, at least, that end a spoiled reply,
+SLOWER = 3.0  # and so many times the usual turnaround
 
 
 @dataclass(slots=True, eq=False)
@@ -199,12 +201,36 @@ class Transaction:
             return
         if self._gap is not None:
             self._gap.cancel()
-        codec = self._codec
-        self._take(codec.feed, data)
-        if not _may_end_by_gap(type(codec)) or self._broken is not None:
-            return
-        if isinstance(codec, EndedByGap) and (gap := codec.gap_timeout):
-            self._gap = channel.loop.call_later(gap, self._take, codec.expire)
+        self._take(self._codec.feed, data)
+        if self._broken is None:
+            self._expect_silence()
+
+    def _expect_silence(self) -> None:
+        """Sets the timer for a silence that ends the frame, or shows that a reply is spoiled."""
+        codec, loop = self._codec, self._channel.loop
+        if _may_end_by_gap(type(codec)):
+            if isinstance(codec, EndedByGap) and (gap := codec.gap_timeout):
+                self._gap = loop.call_later(gap, self._take, codec.expire)
+        elif self._open and (quiet := self._spoiled_after()) is not None:
+            self._gap = loop.call_later(quiet, self._spoiled)
+
+    def _spoiled_after(self) -> float | None:
+        """Returns the silence after which a reply of full length is spoiled; None: it goes on.
+
+        Nothing else follows: the station has replied sooner before.
+        """
+        request, device = self._open[0], self._device
+        if request.future.done() or device.shapes is None or self._stray is not None:
+            return None
+        echo = 0 if self._channel.echo.strip or not self.may_echo else len(request.data)
+        usual = device.usual_turnaround
+        if usual is None or len(self._heard) < request.reply + echo:
+            return None
+        return max(GAP, SLOWER * usual)
+
+    def _spoiled(self) -> None:
+        for request in self._open:
+            _fail(request, self._verdict(request.data))
 
     def _take(self, frames: Callable[..., list[Any]], *data: bytes) -> None:
         try:

@@ -273,6 +273,17 @@ def polls_until_online(rig: Rig, job: Any) -> None:
         job = rig.next()
 
 
+def noise() -> Way:
+    health, spoilt = link_device().health, Garbled("wrong sum", evidence=Evidence.CHECKSUM)
+    for second in range(int(HOUR) + 1):
+        health.unclear(spoilt, None, float(second))
+    assert health.is_noisy(HOUR)
+    late = link_device().health
+    late.unclear(spoilt, None, HOUR)
+    late.replied_late(0.7, 0.5, HOUR, last=False)
+    return lambda after: not (health.is_noisy(HOUR + after) or late.is_noisy(HOUR))
+
+
 def as_quick_as_before() -> Way:
     health, now = link_device().health, HOUR
     health.unclear(SILENCE, None, now)
@@ -305,6 +316,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "a bridge waits for a dead unit": bridge_waits,
     "a device is busy": busy,
     "a device is offline": offline,
+    "noise destroys its replies": noise,
     "a device that returns is as quick as before": as_quick_as_before,
     "earlier requests are kept": kept_requests,
 }

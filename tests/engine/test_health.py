@@ -168,7 +168,7 @@ def test_a_transaction_cut_off_by_the_loss_of_the_port_leaves_its_request_outsta
 @pytest.mark.parametrize("last", [True, False])
 def test_the_last_late_reply_completes_the_resync_and_an_earlier_one_does_not(last: bool) -> None:
     found = health(S.FAILING)
-    found.replied_late(0.7, 0.5, last=last)
+    found.replied_late(0.7, 0.5, 1000.0, last=last)
     assert found.state is S.FAILING  # only a reply in time brings it online
     assert found.needs_resync is not last
     assert found.outstanding == (None if last else SPAN)

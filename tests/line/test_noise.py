@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.noise import PROTOCOLS, measure
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.protocols.modbus import ModbusRtu
@@ -52,7 +53,7 @@ async def measured(others: int, spoiled: float, lost: float) -> float:
 
 @pytest.mark.parametrize(
     ("others", "spoiled", "least"),
-    [(0, 0.1, 0.53), (0, 0.2, 0.2), (0, 0.4, 0.04)],
+    [(0, 0.1, 0.53), (0, 0.2, 0.25), (0, 0.4, 0.07)],
 )
 @on_virtual_time
 async def test_a_noisy_device_keeps_a_share_of_its_polls(
@@ -60,6 +61,17 @@ async def test_a_noisy_device_keeps_a_share_of_its_polls(
 ) -> None:
     """Of 50 polls a second; fewer before damaged replies were a sign of life."""
     assert await measured(others, spoiled, 0.0) >= least * 49
+
+
+@pytest.mark.parametrize("healthy", [0, 8])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@on_virtual_time
+async def test_a_noisy_wire_gives_more_than_half_of_what_it_could_carry(
+    protocol: str, healthy: int
+) -> None:
+    """Of each four damaged replies one is lost, and the others have one wrong bit anywhere."""
+    _, _, share, _, wrong = await measure(protocol, 0.25, healthy, 60.0)
+    assert (float(share) >= 0.6, wrong) == (True, "0")
 
 
 @on_virtual_time

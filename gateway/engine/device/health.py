@@ -15,6 +15,7 @@ from gateway.tags import Reason
 
 PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
 PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
+LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
 PROBE_SPREAD = 0.1  # share by which it varies
 MOST_UNANSWERED = 64  # unanswered requests whose times are kept
@@ -90,6 +91,7 @@ class Health:
     patient: bool = False  # its next probe waits for the whole `reply_timeout`: it replies late
     _last_probe: float = -math.inf  # of an offline device
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
+    _last_late: float = -math.inf  # a late reply, or one to an older request
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
@@ -142,6 +144,8 @@ class Health:
         self.consecutive_failures += 1
         if isinstance(error, Garbled) and error.evidence in OF_THE_WIRE:
             self._last_bytes = now
+        if isinstance(error, Garbled) and error.evidence is Evidence.SHAPE:
+            self._last_late = now
         self._unanswered.append(now)
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
@@ -161,11 +165,12 @@ class Health:
         if outstanding is not None:
             self.outstanding = outstanding
 
-    def replied_late(self, took: float, reply_timeout: float, *, last: bool) -> None:
+    def replied_late(self, took: float, reply_timeout: float, now: float, *, last: bool) -> None:
         """Notes the correct reply after its time-out, `took` seconds after the request.
 
         `last`: no other request is outstanding, so the next frame is no older reply.
         """
+        self._last_late = now
         if last and not self._extra:
             self.needs_resync = False
             self.outstanding = None
@@ -196,6 +201,10 @@ class Health:
     def is_alive(self, now: float) -> bool:
         """Returns True if damaged replies of it arrived a short time ago."""
         return now - self._last_bytes < ALIVE_FOR
+
+    def is_noisy(self, now: float) -> bool:
+        """Returns True if its replies are damaged on the way, and did not come late for long."""
+        return self.is_alive(now) and now - self._last_late >= LATE_FOR
 
     def spoke(self, now: float, longest_reply: float) -> None:
         """Notes a sound frame of an offline device: it replies later than a short probe waits."""

@@ -80,7 +80,7 @@ class Unanswered:
         device.record.count_late()
         if device.state is not State.ONLINE and not _is_error(found, frame):
             timeout = device.timing.reply_timeout
-            device.health.replied_late(now - found.sent, timeout, last=False)
+            device.health.replied_late(now - found.sent, timeout, now, last=False)
             device.health.probe_soon()
         return True
 

@@ -83,7 +83,7 @@ class HealthRules:
             device.record.count_late()
             timeout = device.timing.reply_timeout
             last = self.outstanding_requests(device) <= 1
-            health.replied_late(timeout + late, timeout, last=last)
+            health.replied_late(timeout + late, timeout, now, last=last)
         if before is not State.OFFLINE:
             self._schedule.failed(now, took)
         unknown = before in (State.STARTING, State.OFFLINE)

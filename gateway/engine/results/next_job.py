@@ -26,7 +26,16 @@ from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.request_rules import RequestRules
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.poll_entry import PollEntry
-from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
+from gateway.errors import (
+    BadValue,
+    DeviceError,
+    Garbled,
+    LineDown,
+    NoReply,
+    Refused,
+    Unclear,
+    Unsteady,
+)
 from gateway.protocols.driver import EVERY_REQUEST
 
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
@@ -143,7 +152,7 @@ class NextJob:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
         before = self._results.unclear(device, error, span_of(job), now, time)
-        no_guard = before is State.OFFLINE or _is_short(job)
+        no_guard = before is State.OFFLINE or _is_short(job) or _is_lost(job, error, now)
         settle = Settle(
             device,
             0.0 if no_guard else device.settings.late_guard,
@@ -194,6 +203,17 @@ def _is_suspect(poll: Poll) -> bool:
     """Returns True if the device may be silent about an address of the poll."""
     longer = poll.span is not poll.block.span
     return longer or poll.device.bad_addresses.is_suspect(poll.block)
+
+
+def _is_lost(job: Unfinished, error: DeviceError, now: float) -> bool:
+    """Returns True if noise has likely destroyed the reply: waiting for a late one is no use.
+
+    The resync that follows is safe without the wait: its reply differs. A write keeps the wait, for
+    the late reply tells its outcome.
+    """
+    device = job.device
+    polled = isinstance(error, NoReply) and isinstance(job, Poll | Probe)
+    return polled and device.shapes is not None and device.health.is_noisy(now)
 
 
 def _is_short(job: Unfinished) -> bool:

@@ -38,9 +38,9 @@ class PollEntry:
 
     @property
     def every(self) -> float:
-        """Seconds until it is due again. They grow while no reply arrives."""
+        """Seconds until it is due again. They grow while no reply arrives, and no damaged one."""
         every = self.device.interval(self.block)
-        if self.missed:
+        if self.missed and not self.device.health.is_alive(self.asked):
             every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.missed, 10), PAUSE_LONGEST))
         return every
 

@@ -9,6 +9,7 @@ from gateway.engine.jobs.jobs import Probe
 from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
     PATIENT_AFTER,
+    brief_timeout,
     order_of_start,
     probe_seconds,
     short_timeout,
@@ -51,7 +52,7 @@ class ProbeSchedule:
         if lane > now and (due or not offline):
             return None
         self._in_idle_time = not due
-        return self.probe(device)
+        return self.probe(device, now)
 
     def next(self, others: Sequence[Device], now: float, idle_until: float) -> Probe | float:
         """Returns the probe of a starting or an offline device, or the time of the next one.
@@ -66,7 +67,7 @@ class ProbeSchedule:
         ]
         if starting:
             if idle or self.failing_lane <= now:
-                return self.probe(min(starting, key=order_of_start))
+                return self.probe(min(starting, key=order_of_start), now)
             until = self.failing_lane
         offline = [device for device in others if device.health.state is State.OFFLINE]
         if not offline:
@@ -80,7 +81,7 @@ class ProbeSchedule:
         """Returns the probe that the wire has time for, if any."""
         health, alive = device.health, device.health.is_alive(now)
         if alive:  # its damaged replies show that the wire is the trouble
-            return self.probe(device) if idle_until > now or self.failing_lane <= now else None
+            return self.probe(device, now) if idle_until > now or self.failing_lane <= now else None
         if idle_until <= now < self._offline_lane:
             return None
         short = short_timeout(device, self._devices)
@@ -88,20 +89,23 @@ class ProbeSchedule:
             fits = idle_until - now >= probe_seconds(device)
             self._in_idle_time = fits and not device.driver.traits.over_network
             if self._in_idle_time or self._offline_lane <= now:
-                return self.probe(device, patient=True)
+                return self.probe(device, now, patient=True)
         if short is None:
             return None
         room = idle_until - now
         if room > 0.0:  # no poll is due
             room = max(room, *(device.longest_poll for device in self._devices))
         self._in_idle_time = room >= probe_seconds(device, short)
-        return self.probe(device) if self._in_idle_time or self._offline_lane <= now else None
+        return self.probe(device, now) if self._in_idle_time or self._offline_lane <= now else None
 
-    def probe(self, device: Device, *, patient: bool = False) -> Probe:
-        """Returns a probe. It is short if the device is offline, or starts."""
+    def probe(self, device: Device, now: float, *, patient: bool = False) -> Probe:
+        """Returns a probe. It is short if the device is offline, or starts, or if noise destroys
+        its replies: one that has not come by then does not come."""
         health, timeout = device.health, None
         starting = health.state is State.STARTING and not health.short_probes
-        if not patient and (starting or health.state is State.OFFLINE):
+        if health.is_noisy(now) and health.short_probes < PATIENT_AFTER:
+            timeout = brief_timeout(device)
+        elif not patient and (starting or health.state is State.OFFLINE):
             timeout = short_timeout(device, self._devices)
         health.probed(short=timeout is not None)
         return Probe(device, health.outstanding, health.next_probe_token(), timeout=timeout)

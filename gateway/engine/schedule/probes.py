@@ -35,6 +35,14 @@ def short_timeout(device: Device, devices: Sequence[Device]) -> float | None:
     return min(wait, device.timing.reply_timeout)
 
 
+def brief_timeout(device: Device) -> float | None:
+    """Returns the reply time-out of a short probe for a device that is known to reply sooner."""
+    usual = device.usual_turnaround
+    if usual is None or not _may_be_short(device):
+        return None
+    return min(max(USUAL * usual, SHORTEST), device.timing.reply_timeout)
+
+
 def _may_be_short(device: Device) -> bool:
     """Returns False if a late reply would not name its station, or behind a network.
 

@@ -254,7 +254,7 @@ class Schedule:
         if request is not None:
             self._wrote = True
             return request
-        return None if due else self._probes.probe(first)
+        return None if due else self._probes.probe(first, now)
 
     def _next_poll(self, now: float) -> PollEntry | Probe:
         queue = self._queue
@@ -268,7 +268,7 @@ class Schedule:
         if poll.device.health.needs_resync:
             other = self._first_without_resync() if now < self._probes.failing_lane else None
             if other is None:
-                return self._probes.probe(poll.device)
+                return self._probes.probe(poll.device, now)
             poll = other
             expedited = False
         self._expedited = expedited
