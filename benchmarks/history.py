@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 
 from benchmarks.northbound import memory
+from gateway.parts.history.answers.recent import MOST_RUNS
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.recent import MOST_RUNS
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Publishing, Sample, Tag, good
 from gateway.values import Layout, parse_type

@@ -27,8 +27,8 @@ from gateway.config import ZenohConfig, ZenohMode
 from gateway.contract.interfaces import NoParts
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.session.session_settings import configure
+from gateway.parts.history.answers.recent import MOST_RUNS
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.recent import MOST_RUNS
 from gateway.service.service import THREAD_SWITCH
 from gateway.tags import good
 from tests.zenoh_peer import free_endpoint

@@ -30,7 +30,8 @@ from gateway.config import (
 from gateway.config.commands import TO_ALL, every_command
 from gateway.config.settings.sections import part_sections
 from gateway.config.yaml.file import read_yaml
-from gateway.contract import certificates, payload
+from gateway.contract import payload
+from gateway.contract.access import certificates
 from gateway.contract.keys import Keys
 from gateway.contract.meta import meta
 from gateway.contract.payload import Problem

@@ -9,7 +9,7 @@ import typer
 
 from gateway.cli.terminal import ConfigPath
 from gateway.config import load
-from gateway.contract.timerange import LATEST, time_range
+from gateway.contract.past.timerange import LATEST, time_range
 from gateway.errors import GatewayError
 from gateway.parts.audit.chain import checked
 from gateway.parts.audit.file import read

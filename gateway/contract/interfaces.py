@@ -3,9 +3,9 @@
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from gateway.contract.buckets import Bucket, Now
+from gateway.contract.past.buckets import Bucket, Now
+from gateway.contract.past.question import Question
 from gateway.contract.payload import Failure, GroupResult
-from gateway.contract.question import Question
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import Busy, GatewayError
 from gateway.line.send_permit import Duty

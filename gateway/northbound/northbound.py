@@ -11,11 +11,11 @@ import structlog
 import zenoh
 
 from gateway.config import Config, ZenohConfig, ZenohMode
-from gateway.contract import secrets
+from gateway.contract.access import secrets
+from gateway.contract.access.writers import Writers
 from gateway.contract.interfaces import Device, Parts, Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, GroupResult
-from gateway.contract.writers import Writers
 from gateway.errors import Busy, GatewayError
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.group.admission import Admission
@@ -357,7 +357,7 @@ def check(config: Config) -> list[str]:
     secrets.plant_secret(config.secret_file)
     found = _exposures(session, config.writers_file, group_settings(config))
     if config.zenoh.tls is not None:
-        from gateway.contract.certificates import expiries  # its TLS takes 10 ms
+        from gateway.contract.access.certificates import expiries  # its TLS takes 10 ms
 
         found += expiries(config.zenoh.tls)
     return found

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.certificates import expires
+from gateway.contract.access.certificates import expires
 from gateway.contract.faults import faults
 from gateway.errors import ConfigError
 from tests.conftest import needs

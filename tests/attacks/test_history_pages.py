@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
 
-from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import good
 from tests.e2e.paced_link import paced_link
 from tests.e2e.processes import Program, started, write_config

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gateway.contract.signatures import sign
-from gateway.contract.writers import EARLIEST, LATEST
+from gateway.contract.access.signatures import sign
+from gateway.contract.access.writers import EARLIEST, LATEST
 from gateway.tags.timestamps import rfc3339
 from tests.attacks.security_pages import block, client, plant_file, quoted, serving, table
 from tests.e2e.processes import free_port, plc_gateway

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gateway.cli.history.history_files import Column, write_csv
-from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import Command
 from tests.e2e.processes import vigor_line, write_config

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import good
 from tests.e2e.processes import free_port, started, vigor_line, write_config
 from tests.history_writer import tag

@@ -49,7 +49,7 @@ SavedFile.save = save
 """
 # The command itself, with a history that fails at the first sample.
 BROKEN = """
-from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.store.file import HistoryFile
 def store(self, run, start, samples): raise IndexError("the history is broken")
 HistoryFile.store = store
 from gateway.cli.main import main; main()

@@ -12,9 +12,9 @@ from typing import Any
 
 from gateway.contract import payload
 from gateway.contract.payload import WriteOutcome
-from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.answers.recent import SortedRun
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.recent import SortedRun
+from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value
 from tests.history_writer import WEEK, tag, until

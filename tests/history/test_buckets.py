@@ -13,16 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Now, Step, buckets
-from gateway.contract.question import Question, question
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
+from gateway.contract.past.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Now, Step, buckets
+from gateway.contract.past.question import Question, question
+from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import BadValue, Damaged
-from gateway.parts.history.course import DAMAGED, Course
-from gateway.parts.history.damage import Damage
-from gateway.parts.history.file import HistoryFile
-from gateway.parts.history.newest import Newest
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Recent
+from gateway.parts.history.answers.course import DAMAGED, Course
+from gateway.parts.history.answers.newest import Newest
+from gateway.parts.history.answers.recent import Recent
+from gateway.parts.history.store.damage import Damage
+from gateway.parts.history.store.file import HistoryFile
+from gateway.parts.history.store.reader import Reader
 from gateway.tags import Reason, Sample, bad, good
 from tests.history.recorded import DOOR, NOON, SECOND, SPEED, all_runs, store_run
 

@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.contract import payload
-from gateway.contract.buckets import Bucket, Now
 from gateway.contract.interfaces import History
+from gateway.contract.past.buckets import Bucket, Now
+from gateway.contract.past.question import Question
 from gateway.contract.payload import Failure, Problem, WriteOutcome
-from gateway.contract.question import Question
 from gateway.engine.jobs.requests import CommandResult
 from gateway.northbound.answering.answers import HISTORY_LIMIT
 from gateway.northbound.northbound import Northbound

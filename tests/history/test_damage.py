@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
+from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import Busy, Damaged
-from gateway.parts.history.file import HistoryFile
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Recent
-from gateway.parts.history.schema import ForeignFile
-from gateway.parts.history.search import Search
+from gateway.parts.history.answers.recent import Recent
+from gateway.parts.history.answers.search import Search
+from gateway.parts.history.store.file import HistoryFile
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.schema import ForeignFile
 from gateway.tags import Sample, Tag, good
 from gateway.tags.recorded import RecordedQuery
 from gateway.values import Value

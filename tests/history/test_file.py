@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.store.file import HistoryFile
 from tests.history.recorded import NOON, SECOND, closed_runs, history, numbered, store_run, values
 from tests.history_writer import until
 

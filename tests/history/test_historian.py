@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from gateway.errors import BadValue, Busy
+from gateway.parts.history.answers.recent import Recent
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Recent
-from gateway.parts.history.rows import Row
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.rows import Row
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, bad, good
 from gateway.values import Layout, Value, parse_type

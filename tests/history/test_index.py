@@ -3,8 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
-from gateway.parts.history.index import GROUP, Index, pack
+from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
+from gateway.parts.history.store.index import GROUP, Index, pack
 
 FEW = 100
 

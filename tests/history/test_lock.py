@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy
-from gateway.parts.history import lock
 from gateway.parts.history.historian import Historian
+from gateway.parts.history.store import lock
 from tests.history.recorded import (
     EVERYTHING,
     SMALL,

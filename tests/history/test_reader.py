@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
+from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import Busy
-from gateway.parts.history.file import HistoryFile
-from gateway.parts.history.outcomes import Outcome, Ring
-from gateway.parts.history.reader import Part, Reader, in_order
-from gateway.parts.history.recent import Identity
+from gateway.parts.history.answers.outcomes import Outcome, Ring
+from gateway.parts.history.answers.recent import Identity
+from gateway.parts.history.store.file import HistoryFile
+from gateway.parts.history.store.reader import Part, Reader, in_order
 from gateway.tags import Sample, good
 from tests.history.recorded import (
     DOOR,

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from gateway.contract.past.timerange import time_range
 from gateway.contract.payload import WriteOutcome
-from gateway.contract.timerange import time_range
 from gateway.errors import Busy
+from gateway.parts.history.answers.outcomes import MOST_WAITING
+from gateway.parts.history.answers.recent import MOST_RUNS, SortedRun
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.outcomes import MOST_WAITING
-from gateway.parts.history.recent import MOST_RUNS, SortedRun
-from gateway.parts.history.retention import age
+from gateway.parts.history.store.retention import age
 from gateway.tags import WriteResult, good
 from tests.history.recorded import (
     EVERYTHING,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.timerange import EARLIEST, LATEST
-from gateway.parts.history.rows import checksum, from_row, to_row, with_checksum
+from gateway.contract.past.timerange import EARLIEST, LATEST
+from gateway.parts.history.store.rows import checksum, from_row, to_row, with_checksum
 from gateway.tags import Quality, Reason, Sample, good
 from gateway.values import Value
 from tests.history.recorded import NOON, SPEED

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange, time_range
+from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange, time_range
 from gateway.errors import BadValue
 from tests.history.recorded import NOON, SECOND
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy
-from gateway.parts.history.file import HistoryFile
 from gateway.parts.history.historian import Historian
+from gateway.parts.history.store.file import HistoryFile
 from tests.history.recorded import (
     EVERYTHING,
     SPEED,

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from gateway.contract.access.signatures import sign
+from gateway.contract.access.writers import Writers
 from gateway.contract.keys import Family, Keys, parse_key, part_of
 from gateway.contract.payload import Failure
-from gateway.contract.signatures import sign
-from gateway.contract.writers import Writers
 from gateway.line.send_permit import Duty
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from gateway.config import TlsConfig, ZenohConfig
-from gateway.contract import secrets
+from gateway.contract.access import secrets
 from gateway.errors import ConfigError
 from gateway.northbound.session import exposures
 from gateway.northbound.session.session_settings import configure

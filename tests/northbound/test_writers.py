@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 
 from gateway.config import ZenohConfig
-from gateway.contract.buckets import Bucket, Now
-from gateway.contract.question import Question
-from gateway.contract.signatures import sign
-from gateway.contract.writers import (
+from gateway.contract.access.signatures import sign
+from gateway.contract.access.writers import (
     EARLIEST,
     KEPT,
     LATEST,
     MOST_KEPT,
     Writers,
 )
+from gateway.contract.past.buckets import Bucket, Now
+from gateway.contract.past.question import Question
 from gateway.errors import ConfigError, NotAllowed, Repeated
 from gateway.northbound.northbound import Files
 from gateway.northbound.requests.accepted import AcceptedUntil

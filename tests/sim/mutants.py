@@ -37,7 +37,7 @@ ROOMS = {
     "protocols": "protocols line",
     "parts/alarms": "alarms",
     "parts/transfers": "transfers",
-    "contract/writers.py": "northbound",
+    "contract/access/writers.py": "northbound",
     "northbound/group": "northbound",
     "northbound/requests": "northbound",
 }

@@ -3,7 +3,7 @@
 import os
 import time
 
-from gateway.contract.signatures import sign
+from gateway.contract.access.signatures import sign
 from gateway.errors import ConfigError
 from gateway.tags.timestamps import rfc3339
 

@@ -18,7 +18,7 @@ from gateway.config.file_rules import written
 from gateway.config.messages import dotted
 from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
-from gateway.parts.history.place import trouble
+from gateway.parts.history.store.place import trouble
 from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
 from gateway.parts.web import exposure
 from gateway.planning.planner import describe

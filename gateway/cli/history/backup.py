@@ -8,7 +8,7 @@ import typer
 from gateway.cli.terminal import ConfigPath
 from gateway.config import load
 from gateway.errors import GatewayError
-from gateway.parts.history.backup import backup as copied
+from gateway.parts.history.files.backup import backup as copied
 from gateway.parts.history.settings import HistorySection
 
 

@@ -12,15 +12,15 @@ from gateway.cli.client.arguments import matches, wanted_keys
 from gateway.cli.history.history_files import Column, new_file, write_csv, writer_of
 from gateway.cli.terminal import ConfigPath, TagNames, err
 from gateway.config import Config, load
-from gateway.contract.buckets import Now
-from gateway.contract.question import Question, question
-from gateway.contract.timerange import TimeRange, time_range
+from gateway.contract.past.buckets import Now
+from gateway.contract.past.question import Question, question
+from gateway.contract.past.timerange import TimeRange, time_range
 from gateway.errors import Damaged, GatewayError
-from gateway.parts.history.aside import asides, rename
-from gateway.parts.history.course import Course
-from gateway.parts.history.offline import offline
-from gateway.parts.history.salvage import salvage as salvaged
-from gateway.parts.history.search import Search
+from gateway.parts.history.answers.course import Course
+from gateway.parts.history.answers.search import Search
+from gateway.parts.history.files.aside import asides, rename
+from gateway.parts.history.files.offline import offline
+from gateway.parts.history.files.salvage import salvage as salvaged
 from gateway.parts.history.settings import HistorySection
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.tags.recorded import RecordedQuery

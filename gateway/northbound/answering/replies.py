@@ -6,14 +6,15 @@ from itertools import islice
 
 import zenoh
 
-from gateway.contract import bucket_documents as buckets
-from gateway.contract import past, payload
-from gateway.contract.buckets import Bucket, Now
+from gateway.contract import payload
 from gateway.contract.interfaces import History, Parts, Plant
 from gateway.contract.keys import Family, Keys, ParsedKey
 from gateway.contract.meta import meta
+from gateway.contract.past import bucket_documents as buckets
+from gateway.contract.past import samples as past
+from gateway.contract.past.buckets import Bucket, Now
+from gateway.contract.past.question import Question, question
 from gateway.contract.payload import Failure, Problem, Result
-from gateway.contract.question import Question, question
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 
 import zenoh
 
-from gateway.contract import secrets
+from gateway.contract.access import secrets
 from gateway.contract.keys import Keys
 from gateway.line.send_permit import Duty
 from gateway.northbound.group.claiming import NETWORK_WITHIN, Claiming

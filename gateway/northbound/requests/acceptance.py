@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import zenoh
 
+from gateway.contract.access.signatures import LONGEST
+from gateway.contract.access.writers import Writers
 from gateway.contract.foreign import Foreign
 from gateway.contract.parsing import check_encoding
-from gateway.contract.signatures import LONGEST
-from gateway.contract.writers import Writers
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import orjson
 
-from gateway.contract.writers import EARLIEST, LATEST
+from gateway.contract.access.writers import EARLIEST, LATEST
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import structlog
 import zenoh
 
-from gateway.contract import secrets
+from gateway.contract.access import secrets
 from gateway.errors import ConfigError
 from gateway.northbound.session.session_settings import endpoints, reachable
 from gateway.plant.threads import off_loop

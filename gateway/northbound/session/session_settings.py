@@ -9,7 +9,7 @@ import zenoh
 from gateway import files
 from gateway.config import TlsConfig, ZenohConfig, ZenohMode
 from gateway.config.settings import parsers
-from gateway.contract import secrets
+from gateway.contract.access import secrets
 from gateway.errors import ConfigError
 from gateway.northbound.session.exposures import describe_error
 
@@ -134,7 +134,7 @@ def _tls(tls: TlsConfig | None) -> dict[str, object]:
     """Returns Zenoh's settings; incoming and outgoing links use the same certificate."""
     if tls is None:
         return {}
-    from gateway.contract.certificates import check_files  # its TLS takes 10 ms
+    from gateway.contract.access.certificates import check_files  # its TLS takes 10 ms
 
     if tls.key is not None:
         secrets.closed_to_others(tls.key, "zenoh.tls.key")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from gateway import files
 from gateway.config import Config, TlsConfig
-from gateway.contract.certificates import check_files, document, expires
+from gateway.contract.access.certificates import check_files, document, expires
 from gateway.errors import ConfigError
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.plant.threads import off_loop

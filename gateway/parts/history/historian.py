@@ -9,19 +9,19 @@ from os.path import realpath
 from pathlib import Path
 from typing import TypeVar
 
-from gateway.contract.buckets import Bucket, Now
-from gateway.contract.question import Question
-from gateway.contract.timerange import TimeRange, time_range
+from gateway.contract.past.buckets import Bucket, Now
+from gateway.contract.past.question import Question
+from gateway.contract.past.timerange import TimeRange, time_range
 from gateway.errors import BadValue, Busy
-from gateway.parts.history.course import Course
-from gateway.parts.history.newest import Newest
-from gateway.parts.history.outcomes import Outcome, Outcomes, Ring
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Recent
-from gateway.parts.history.retention import Retention
-from gateway.parts.history.search import Search
-from gateway.parts.history.transfer import Transfer
-from gateway.parts.history.writer import Writer
+from gateway.parts.history.answers.course import Course
+from gateway.parts.history.answers.newest import Newest
+from gateway.parts.history.answers.outcomes import Outcome, Outcomes, Ring
+from gateway.parts.history.answers.recent import Recent
+from gateway.parts.history.answers.search import Search
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.retention import Retention
+from gateway.parts.history.store.transfer import Transfer
+from gateway.parts.history.store.writer import Writer
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339

@@ -13,14 +13,15 @@ from typing import Any
 
 from aiohttp import web
 
-from gateway.contract import bucket_documents as buckets
-from gateway.contract import past, payload
-from gateway.contract.buckets import Now
+from gateway.contract import payload
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.interfaces import History
 from gateway.contract.meta import meta_fields
+from gateway.contract.past import bucket_documents as buckets
+from gateway.contract.past import samples as past
+from gateway.contract.past.buckets import Now
+from gateway.contract.past.question import question
 from gateway.contract.payload import Problem
-from gateway.contract.question import question
 from gateway.errors import BadValue, Busy, GatewayError
 from gateway.parts.web.connections import client_of
 from gateway.parts.web.guard import BY

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
-from gateway.contract.named_secrets import NamedSecrets
+from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.parts.web.connections import Connections, client_of
 from gateway.parts.web.places import Places
 from gateway.parts.web.replies import answer, send

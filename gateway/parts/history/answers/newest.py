@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator
 from operator import itemgetter
 
-from gateway.contract.timerange import TimeRange
-from gateway.parts.history.damage import Damage
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Recent
-from gateway.parts.history.rows import from_row
-from gateway.parts.history.search import StoredRuns
+from gateway.contract.past.timerange import TimeRange
+from gateway.parts.history.answers.recent import Recent
+from gateway.parts.history.answers.search import StoredRuns
+from gateway.parts.history.store.damage import Damage
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.rows import from_row
 from gateway.tags import Sample, Tag
 from gateway.tags.sample import has_value
 

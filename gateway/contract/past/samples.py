@@ -5,7 +5,7 @@ from itertools import islice
 from typing import TypeVar
 
 from gateway.contract.interfaces import History
-from gateway.contract.question import Question
+from gateway.contract.past.question import Question
 from gateway.errors import Damaged
 from gateway.tags import Sample, Tag
 from gateway.tags.sample import has_value

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import structlog
 
-from gateway.contract.secrets import readable_secret
+from gateway.contract.access.secrets import readable_secret
 from gateway.errors import ConfigError
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -5,13 +5,13 @@ from collections.abc import Callable, Collection, Container, Iterable, Iterator,
 from functools import partial
 from operator import itemgetter
 
-from gateway.contract.timerange import EARLIEST, TimeRange
+from gateway.contract.past.timerange import EARLIEST, TimeRange
 from gateway.errors import Busy, Damaged
-from gateway.parts.history.damage import Damage
-from gateway.parts.history.index import GROUP, Places
-from gateway.parts.history.reader import Part, Reader, in_order
-from gateway.parts.history.recent import Identity, Recent, SortedRun
-from gateway.parts.history.rows import Row, from_row
+from gateway.parts.history.answers.recent import Identity, Recent, SortedRun
+from gateway.parts.history.store.damage import Damage
+from gateway.parts.history.store.index import GROUP, Places
+from gateway.parts.history.store.reader import Part, Reader, in_order
+from gateway.parts.history.store.rows import Row, from_row
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339

@@ -6,13 +6,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from gateway.errors import GatewayError
-from gateway.parts.history.course import Course
-from gateway.parts.history.damage import Damage
-from gateway.parts.history.file import identity, next_number, runs_of
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Extent, Recent
-from gateway.parts.history.schema import APPLICATION, SCHEMA_VERSION
-from gateway.parts.history.search import Search
+from gateway.parts.history.answers.course import Course
+from gateway.parts.history.answers.recent import Extent, Recent
+from gateway.parts.history.answers.search import Search
+from gateway.parts.history.store.damage import Damage
+from gateway.parts.history.store.file import identity, next_number, runs_of
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.schema import APPLICATION, SCHEMA_VERSION
 
 _MOST_BUCKETS = 10_000_000  # of one tag: nobody waits for this reader
 

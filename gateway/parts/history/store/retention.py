@@ -4,9 +4,9 @@ import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
-from gateway.parts.history.file import HistoryFile
-from gateway.parts.history.outcomes import Ring
-from gateway.parts.history.recent import Recent, SortedRun
+from gateway.parts.history.answers.outcomes import Ring
+from gateway.parts.history.answers.recent import Recent, SortedRun
+from gateway.parts.history.store.file import HistoryFile
 
 _ROOM_OF_OUTCOME = 1024  # bytes in the file; of writes and alarms a tenth each
 # Runs that may expire between two checks. Few, because the wall clock may be wrong for a while.

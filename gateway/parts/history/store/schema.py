@@ -3,7 +3,7 @@
 import sqlite3
 from pathlib import Path
 
-from gateway.parts.history.outcomes import Ring
+from gateway.parts.history.answers.outcomes import Ring
 
 APPLICATION = 0x706C6368  # "plch", in the file's header
 SCHEMA_VERSION = 2

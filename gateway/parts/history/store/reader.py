@@ -10,13 +10,13 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.contract.timerange import LATEST, TimeRange
+from gateway.contract.past.timerange import LATEST, TimeRange
 from gateway.errors import Busy, Damaged
-from gateway.parts.history.file import identity, is_damage, oldest, tags
-from gateway.parts.history.index import Index
-from gateway.parts.history.outcomes import Outcome, Ring
-from gateway.parts.history.recent import Identity, SortedRun
-from gateway.parts.history.rows import Row, checksum
+from gateway.parts.history.answers.outcomes import Outcome, Ring
+from gateway.parts.history.answers.recent import Identity, SortedRun
+from gateway.parts.history.store.file import identity, is_damage, oldest, tags
+from gateway.parts.history.store.index import Index
+from gateway.parts.history.store.rows import Row, checksum
 from gateway.tags import Sample
 
 _MOST_INDEXES = 100  # in memory, of 64 to 320 kB

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from gateway.contract.timerange import EARLIEST, TimeRange
+from gateway.contract.past.timerange import EARLIEST, TimeRange
 from gateway.errors import BadValue
 from gateway.values import Value
 from gateway.values.numerals import Scalar

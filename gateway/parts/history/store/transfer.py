@@ -3,10 +3,10 @@
 import sqlite3
 from collections.abc import Callable, Sequence
 
-from gateway.parts.history.file import HistoryFile
-from gateway.parts.history.outcomes import Outcomes
-from gateway.parts.history.recent import Recent, Run
-from gateway.parts.history.retention import Retention
+from gateway.parts.history.answers.outcomes import Outcomes
+from gateway.parts.history.answers.recent import Recent, Run
+from gateway.parts.history.store.file import HistoryFile
+from gateway.parts.history.store.retention import Retention
 
 BATCH_SIZE = 8192  # samples in one transaction
 

@@ -7,10 +7,10 @@ from contextlib import closing
 from pathlib import Path
 
 from gateway.errors import GatewayError
-from gateway.parts.history import aside
-from gateway.parts.history.file import HistoryFile
-from gateway.parts.history.lock import locked
-from gateway.parts.history.outcomes import Ring
+from gateway.parts.history.answers.outcomes import Ring
+from gateway.parts.history.files import aside
+from gateway.parts.history.store.file import HistoryFile
+from gateway.parts.history.store.lock import locked
 
 _RUN = 32_768  # samples
 _SIZE = 10**12  # bytes: the gateway drops what is too much

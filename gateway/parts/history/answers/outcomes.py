@@ -9,8 +9,8 @@ from collections import deque
 from enum import StrEnum
 from typing import NamedTuple
 
-from gateway.contract.timerange import TimeRange
-from gateway.parts.history.recent import Identity
+from gateway.contract.past.timerange import TimeRange
+from gateway.parts.history.answers.recent import Identity
 
 MOST_WAITING = 10_000
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import structlog
 
-from gateway.parts.history.recent import Identity, SortedRun
+from gateway.parts.history.answers.recent import Identity, SortedRun
 from gateway.tags.timestamps import rfc3339
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from typing import NamedTuple, Protocol
 
-from gateway.contract.timerange import duration
+from gateway.contract.past.timerange import duration
 from gateway.errors import BadValue
 
 AGGREGATES = ("min", "max", "mean", "last")

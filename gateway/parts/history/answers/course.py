@@ -11,14 +11,14 @@ from heapq import merge
 from operator import itemgetter
 from typing import NamedTuple
 
-from gateway.contract.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Now, Step, buckets
-from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
+from gateway.contract.past.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Now, Step, buckets
+from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import Busy, Damaged
-from gateway.parts.history.damage import Damage
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.recent import Identity, Recent, SortedRun
-from gateway.parts.history.rows import step
-from gateway.parts.history.search import StoredRuns
+from gateway.parts.history.answers.recent import Identity, Recent, SortedRun
+from gateway.parts.history.answers.search import StoredRuns
+from gateway.parts.history.store.damage import Damage
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.rows import step
 from gateway.tags import Quality, Reason, Sample, Tag
 
 _MOST = math.inf

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import structlog
 
-from gateway.contract.timerange import LATEST
+from gateway.contract.past.timerange import LATEST
 from gateway.errors import Damaged
-from gateway.parts.history.aside import Salvaged, move
-from gateway.parts.history.index import pack
-from gateway.parts.history.lock import close_to_others, locked
-from gateway.parts.history.outcomes import Outcome, Ring
-from gateway.parts.history.recent import Extent, Identity, SortedRun
-from gateway.parts.history.rows import checksum, to_row, with_checksum
-from gateway.parts.history.schema import prepare
+from gateway.parts.history.answers.outcomes import Outcome, Ring
+from gateway.parts.history.answers.recent import Extent, Identity, SortedRun
+from gateway.parts.history.files.aside import Salvaged, move
+from gateway.parts.history.store.index import pack
+from gateway.parts.history.store.lock import close_to_others, locked
+from gateway.parts.history.store.rows import checksum, to_row, with_checksum
+from gateway.parts.history.store.schema import prepare
 from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.contract import signatures
-from gateway.contract.named_secrets import NamedSecrets
+from gateway.contract.access import signatures
+from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.errors import NotAllowed, Repeated
 from gateway.tags.timestamps import rfc3339
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import orjson
 
-from gateway.parts.history.outcomes import Outcome, Ring
-from gateway.parts.history.rows import Stored, checksum
+from gateway.parts.history.answers.outcomes import Outcome, Ring
+from gateway.parts.history.store.rows import Stored, checksum
 
 _TAILS = ("-wal", "-shm", "-journal")
 _PAGE = 4096

@@ -11,11 +11,11 @@ from pathlib import Path
 import structlog
 
 from gateway.errors import Damaged
-from gateway.parts.history.aside import asides
-from gateway.parts.history.file import HistoryFile, is_damage, move_aside
-from gateway.parts.history.reader import Reader
-from gateway.parts.history.schema import ForeignFile
-from gateway.parts.history.transfer import Transfer
+from gateway.parts.history.files.aside import asides
+from gateway.parts.history.store.file import HistoryFile, is_damage, move_aside
+from gateway.parts.history.store.reader import Reader
+from gateway.parts.history.store.schema import ForeignFile
+from gateway.parts.history.store.transfer import Transfer
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 

@@ -8,7 +8,7 @@ from itertools import accumulate
 from typing import NamedTuple
 from zlib import crc32
 
-from gateway.contract.timerange import TimeRange
+from gateway.contract.past.timerange import TimeRange
 from gateway.errors import Damaged
 
 GROUP = 1024  # samples whose first and last time is known

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import orjson
 
-from gateway.contract.buckets import Bucket
+from gateway.contract.past.buckets import Bucket
 from gateway.tags.timestamps import rfc3339
 
 

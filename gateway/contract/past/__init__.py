@@ -1,0 +1,1 @@
+"""Questions of the past and their answers, on Zenoh and HTTP alike."""

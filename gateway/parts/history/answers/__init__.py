@@ -1,0 +1,1 @@
+"""Queries of the past: samples in memory and in the file."""

@@ -1,0 +1,1 @@
+"""Other history files: moved aside, backups, those of a stopped gateway."""

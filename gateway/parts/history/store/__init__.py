@@ -1,0 +1,1 @@
+"""The history file, and the thread that writes it."""
