@@ -27,19 +27,3 @@ else:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         found = globals()[name] = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
         return found
-
-
-__all__ = [
-    "Config",
-    "ConfigErrors",
-    "LineConfig",
-    "TlsConfig",
-    "SheetUse",
-    "ZenohConfig",
-    "ZenohMode",
-    "built",
-    "expanded_text",
-    "load",
-    "state_folder",
-    "schema",
-]

@@ -4,23 +4,3 @@ from gateway.tags.alarm import AlarmRule, Level
 from gateway.tags.publishing import Deadband, Form, Publish, Publishing
 from gateway.tags.sample import Quality, Reason, Sample, WriteResult, bad, good, of_field
 from gateway.tags.tag import Label, Origin, Tag, WriteRule
-
-__all__ = [
-    "AlarmRule",
-    "Deadband",
-    "Form",
-    "Label",
-    "Level",
-    "Origin",
-    "Publish",
-    "Publishing",
-    "Quality",
-    "Reason",
-    "Sample",
-    "Tag",
-    "WriteResult",
-    "WriteRule",
-    "bad",
-    "good",
-    "of_field",
-]

@@ -95,22 +95,3 @@ def _name(where: ModemAddress) -> str:
             return path
         case TcpAddress(host, port) | Rfc2217Address(host, port):
             return f"{host}:{port}"
-
-
-__all__ = [
-    "ModemAddress",
-    "ModemSettings",
-    "OpenBelow",
-    "Receiver",
-    "Port",
-    "PortAddress",
-    "Rfc2217Address",
-    "SerialPath",
-    "SerialSettings",
-    "SimulatorAddress",
-    "TcpAddress",
-    "open_modem",
-    "open_port",
-    "parse_port",
-    "prepare",
-]

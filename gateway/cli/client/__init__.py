@@ -10,15 +10,3 @@ from gateway.cli.client.arguments import (
 from gateway.cli.client.client import Client
 from gateway.cli.client.connection import connected, reached
 from gateway.cli.client.rows import Row
-
-__all__ = [
-    "Client",
-    "Row",
-    "connected",
-    "matches",
-    "parse_value",
-    "reached",
-    "suggestion",
-    "tags_by_key",
-    "wanted_keys",
-]

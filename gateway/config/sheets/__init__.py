@@ -7,14 +7,3 @@ by their titles. Nothing here knows addresses or limits: the configuration check
 from gateway.config.sheets import link_table
 from gateway.config.sheets.grid import Grid, neutral, read_grid
 from gateway.config.sheets.sheet import Sheet, SheetMistake, devices_in, read_sheet
-
-__all__ = [
-    "Grid",
-    "Sheet",
-    "SheetMistake",
-    "devices_in",
-    "link_table",
-    "neutral",
-    "read_grid",
-    "read_sheet",
-]

@@ -10,14 +10,3 @@ from gateway.protocols.computer_link.codec import (
 )
 from gateway.protocols.computer_link.driver import ComputerLink
 from gateway.protocols.computer_link.replies import NO_REPLY_CAUSES
-
-__all__ = [
-    "NO_REPLY_CAUSES",
-    "Ack",
-    "ComputerLink",
-    "Enquiry",
-    "Frame",
-    "LinkCodec",
-    "Nak",
-    "Text",
-]

@@ -11,16 +11,3 @@ from gateway.protocols.frames.fields import Field
 from gateway.protocols.frames.framing import Framing
 from gateway.protocols.frames.listener import Listener
 from gateway.protocols.frames.messages import Ask, Listen, Write
-
-__all__ = [
-    "Ask",
-    "Field",
-    "FrameCodec",
-    "FrameDriver",
-    "FrameReader",
-    "Frames",
-    "Framing",
-    "Listen",
-    "Listener",
-    "Write",
-]

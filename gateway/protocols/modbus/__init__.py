@@ -5,14 +5,3 @@ from gateway.protocols.modbus.drivers import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.mbap import MbapCodec
 from gateway.protocols.modbus.rtu import RtuCodec, RtuSlaveCodec
-
-__all__ = [
-    "AsciiCodec",
-    "Frame",
-    "MbapCodec",
-    "ModbusAscii",
-    "ModbusRtu",
-    "ModbusTcp",
-    "RtuCodec",
-    "RtuSlaveCodec",
-]

@@ -2,5 +2,3 @@
 
 from gateway.protocols.vigor.codec import Frame, Reply, Request, VigorCodec
 from gateway.protocols.vigor.driver import Vigor
-
-__all__ = ["Frame", "Reply", "Request", "Vigor", "VigorCodec"]

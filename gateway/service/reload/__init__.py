@@ -3,5 +3,3 @@
 from gateway.service.reload.lines import RunningLines
 from gateway.service.reload.live import LiveReload
 from gateway.service.reload.reloader import Reloader
-
-__all__ = ["LiveReload", "Reloader", "RunningLines"]

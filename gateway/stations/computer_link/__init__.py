@@ -3,8 +3,6 @@
 from gateway.protocols.computer_link import ComputerLink
 from gateway.stations.computer_link.station import ComputerLinkStation
 
-__all__ = ["ComputerLinkStation", "computer_link_station"]
-
 
 def computer_link_station(driver: ComputerLink) -> ComputerLinkStation:
     """Returns the station that the driver can talk to."""
