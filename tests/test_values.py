@@ -46,7 +46,8 @@ def layout(kind: str, words: Order = LOW, octets: Order = HIGH) -> Layout:
 @pytest.mark.parametrize(
     ("text", "words"),
     [("bool", 1), ("int16", 1), ("bcd16", 1), ("float32", 2), ("bcd32", 2), ("int64", 4),
-     ("float64", 4), ("string[1]", 1), ("string[16]", 8), ("string[17]", 9), ("string[250]", 125)],
+     ("float64", 4), ("string[1]", 1), ("string[16]", 8), ("string[17]", 9), ("string[250]", 125),
+     ("telephone", 6)],
 )  # fmt: skip
 def test_the_number_of_words_of_a_type(text: str, words: int) -> None:
     kind = parse_type(text)
@@ -57,7 +58,7 @@ def test_the_number_of_words_of_a_type(text: str, words: int) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "int", "INT16", " int16", "string", "string[]", "string[0]", "string[251]",
-     "string[-1]", "string[١]", "string[16]\n", "int16\n"],
+     "string[-1]", "telephone[2]", "string[١]", "string[16]\n", "int16\n"],
 )  # fmt: skip
 def test_invalid_types_are_refused(text: str) -> None:
     with pytest.raises(ConfigError):
@@ -94,6 +95,12 @@ WORKED: list[tuple[Layout, list[int], Scalar]] = [
     (layout("string[4]"), [0x4142, 0x0000], "AB"),
     (layout("string[2]"), [0xE4B0], "ä°"),
     (layout("string[2]"), [0x0000], ""),
+    # VB/VH manual, B-3-8, program of the PLC on the right; and 2620-4393 as its picture has it
+    (layout("telephone"), [0x0262, 0x6794, 0xE, 0, 0, 0], "2620-4976"),
+    (layout("telephone", HIGH), [0x0262, 0x3934, 0xE, 0, 0, 0], "2620-4393"),
+    (layout("telephone"), [0x0262, 0x6794, 0xE0, 0, 0, 0], "2620-4976-0"),
+    (layout("telephone"), [0xE, 0, 0, 0, 0, 0], ""),
+    (layout("telephone"), [0x4321] * 6, "1234-1234-1234-1234-1234-1234"),
 ]
 
 

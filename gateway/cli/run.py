@@ -111,6 +111,8 @@ def _example(tag: Tag) -> str:
     kind, rule = tag.layout.type, tag.write or WriteRule()
     if kind.kind is Kind.STRING:
         return "AB"[: kind.length]
+    if kind.is_text:
+        return "2620-4976"
     if not kind.is_number:
         return "true"
     value = 1 if rule.min is None else rule.min + 1

@@ -143,10 +143,10 @@ def _parsed(text: str, tag: Tag) -> Value:
     """Returns the value that the text means for this tag."""
     if tag.shaping.names is not None and text in tag.shaping.names.by_number.values():
         return text  # `on` is a name here
-    kind, parsed = tag.layout.type.kind, parse_value(text)
-    if kind is Kind.BOOL and text.lower() in _SWITCH and tag.element is None:
+    kind, parsed = tag.layout.type, parse_value(text)
+    if kind.kind is Kind.BOOL and text.lower() in _SWITCH and tag.element is None:
         return _SWITCH[text.lower()]
-    if kind is Kind.STRING and not isinstance(parsed, str):
+    if kind.is_text and not isinstance(parsed, str):
         return text  # 12 is a text for this tag
     return parsed
 

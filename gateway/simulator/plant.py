@@ -45,7 +45,7 @@ def _animate(memory: Memory, tag: Tag, number: int) -> None:
         units = tag.encode(motion(0.0))
     except BadValue:
         return  # the limits of the tag exclude this value
-    if tag.write is not None or tag.layout.type.kind is Kind.STRING:
+    if tag.write is not None or tag.layout.type.is_text:
         memory.write(area, start, units)
         return
     for i in range(size):
@@ -67,6 +67,8 @@ class _Unit:
 def _motion(tag: Tag, number: int) -> Callable[[float], Value]:
     """Returns the value of the tag as a function of time; each tag moves differently."""
     kind = tag.layout.type.kind
+    if kind is Kind.TELEPHONE:
+        return lambda now: "2620-4976"
     if kind is Kind.STRING:
         return lambda now: "SIMULATED"[: tag.layout.type.length]
     if kind is Kind.BOOL:

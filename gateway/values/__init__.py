@@ -13,7 +13,14 @@ from enum import StrEnum
 from operator import index
 
 from gateway.errors import BadValue, ConfigError
-from gateway.values.numerals import Scalar, real, shortest, whole
+from gateway.values.numerals import (
+    Scalar,
+    real,
+    shortest,
+    telephone_number,
+    telephone_words,
+    whole,
+)
 
 Value = Scalar | tuple[Scalar, ...]  # several: of an array
 Words = Sequence[int]
@@ -37,6 +44,7 @@ class Kind(StrEnum):
     BCD16 = "bcd16"
     BCD32 = "bcd32"
     STRING = "string"
+    TELEPHONE = "telephone"  # the registers of a Vigor PLC with a modem
 
 
 class Order(StrEnum):
@@ -67,6 +75,7 @@ _WORDS = {
     Kind.INT64: 4,
     Kind.UINT64: 4,
     Kind.FLOAT64: 4,
+    Kind.TELEPHONE: 6,
 }
 _STRUCT = {
     Kind.INT8: ">b",
@@ -83,6 +92,7 @@ _STRUCT = {
 _FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
 _BCD = (Kind.BCD16, Kind.BCD32)
 BYTES = (Kind.INT8, Kind.UINT8)
+NO_ELEMENTS = (*BYTES, Kind.TELEPHONE)  # of an array
 LONGEST_STRING = 250
 LONGEST_ARRAY = 2000  # elements: as many bits as one request of Modbus reads
 
@@ -125,7 +135,11 @@ class ValueType:
 
     @property
     def is_number(self) -> bool:
-        return self.kind not in (Kind.BOOL, Kind.STRING)
+        return not (self.is_text or self.kind is Kind.BOOL)
+
+    @property
+    def is_text(self) -> bool:
+        return self.kind in (Kind.STRING, Kind.TELEPHONE)
 
     @property
     def is_float(self) -> bool:
@@ -154,7 +168,7 @@ def parse_type(text: str) -> ValueType:
             "uint16[50]"
         )
     kind = Kind(name)
-    if match and kind in BYTES:
+    if match and kind in NO_ELEMENTS:
         raise ConfigError(f"{text}: an array has whole words or bits: use uint16[n] or int16[n]")
     if match and not 1 <= size <= LONGEST_ARRAY:
         raise ConfigError(f"{text}: an array has 1 to {LONGEST_ARRAY} elements")
@@ -196,6 +210,8 @@ def from_words(layout: Layout) -> FromWords:
         return lambda words: ((words[0] >> shift & 0xFF) ^ sign) - sign
     if kind in _BCD:
         return lambda words: _from_bcd(_ordered(words, layout))
+    if kind is Kind.TELEPHONE:
+        return telephone_number
     unpack = struct.Struct(_STRUCT[kind]).unpack
     if kind is Kind.FLOAT32:
         return lambda words: shortest(unpack(_octets(_ordered(words, layout)))[0])
@@ -235,6 +251,8 @@ def to_words(layout: Layout) -> ToWords:
     if kind in _BCD:
         digits = 4 * layout.type.words
         return lambda value: _ordered(_to_bcd(whole(value), digits), layout)
+    if kind is Kind.TELEPHONE:
+        return telephone_words
     pack = struct.Struct(_STRUCT[kind]).pack
     convert: Callable[[Scalar], int | float] = real if kind in _FLOATS else whole
 

@@ -1,7 +1,9 @@
 """Numbers as people write them: shortest digits, whole numbers, decimals of JSON, distances."""
 
 import math
+import re
 import struct
+from collections.abc import Sequence
 from decimal import Context, Decimal
 
 from gateway.errors import BadValue
@@ -62,6 +64,28 @@ def real(value: Scalar) -> float:
     if not math.isfinite(number):
         raise BadValue(f"{value} is not a finite number")
     return number
+
+
+_TELEPHONE = re.compile(r"[0-9A-DF]{0,24}\Z")
+_PLACES, _END = 24, "E"  # of the registers of a PLC, and the code behind the last digit
+
+
+def telephone_number(words: Sequence[int]) -> str:
+    """Returns a number as people write it, `2620-4976`. The lowest digit of a word is the first."""
+    digits = "".join(f"{word:04X}"[::-1] for word in words).partition(_END)[0]
+    return "-".join(digits[at : at + 4] for at in range(0, len(digits), 4))
+
+
+def telephone_words(value: Scalar) -> list[int]:
+    """Returns the inverse of `telephone_number`. Hyphens and spaces count nothing.
+
+    The letters are other codes of the PLC, such as its pause. Raises `BadValue`.
+    """
+    digits = re.sub("[- ]", "", str(value)).upper()
+    if isinstance(value, (bool, float)) or not _TELEPHONE.match(digits):
+        raise BadValue(f"{value!r} is no telephone number: up to 24 digits, such as 2620-4976")
+    digits = (digits + _END).ljust(_PLACES, "0")
+    return [int(digits[at : at + 4][::-1], 16) for at in range(0, _PLACES, 4)]
 
 
 def as_decimal(value: Scalar) -> Decimal:

@@ -70,6 +70,7 @@ RS = {
     "M9123": "receive done",
     "M9124": "cd signal",
     "M9129": "time-out",
+    "M9161": "8-bit mode",
     "D9063": "communication error",
     "D9122": "left",
     "D9123": "received",
@@ -82,7 +83,30 @@ MODEM = {
     "M9100": "start",
     "M9101": "failed",
     "M9124": "cd signal",
-    **{f"D{number}": "telephone number" for number in range(9110, 9116)},
+    "D9110": "telephone number",  # to D9115
+}
+# B-3-3 and others, comments of the programs
+DISPLAY = {"D9080": "display mode", "D9081": "displayed"}
+DISPLAY_MODES = {3: "4-digit", 4: "two 2-digit"}
+# B-4-4, BFM #28: status, and the error codes of BFM #29 below it
+VB_1COM_STATUS = {
+    0: "send complete",
+    1: "receive complete",
+    2: "receive time-out",
+    3: "error occur",
+    6: "data sending",
+    7: "data receiving",
+}
+VB_1COM_CODES = {
+    0: "no error",
+    1: "parity, overrun",
+    3: "defective receive character",
+    4: "receive sum check",
+    6: "baud rate setting",
+    7: "receive cr",
+    8: "receive lf",
+    9: "initial terminator setting",
+    10: "receive terminator",
 }
 # FNC 89 and FNC 149: the upper 8 bits of the first word of the working area
 LINK_CODES = {
@@ -107,6 +131,26 @@ MODCOM_CODES = {
     9: "parameter error",
     10: "station error",
 }
+# LS MASTER-K120S, 8.4.3, DSND (3) Error code
+DSND_CODES = {6: "parameter error", 8: "slave device busy", 9: "frame type error"}
+# LS MASTER-K120S, 8.3.4: Error (F110), Zero (F111), Carry (F112)
+K120S_FLAGS = {"F0110": "error", "F0111": "zero", "F0112": "carry"}
+# Liyan Computer Link manual, 2-11 and 2-12; the registers, M8063 and its codes as in the manual of
+# Mitsubishi that it shortens (FX communication, chapters 6, 7 and 12)
+LIYAN = {
+    "M8035": "forced run mode",
+    "M8036": "forced run",
+    "M8037": "forced stop",
+    "M8063": "error",
+    "M8126": "global flag",
+    "D8063": "code",
+    "D8120": "communication format",
+    "D8120.13": "sum check",
+    "D8120.15": "format 4",
+    "D8121": "station number",
+    "D8129": "time-out",
+}
+LIYAN_CODES = {0: "no error", 6301: "parity, overrun or framing", 6305: "gw", 6306: "incomplete"}
 # Liyan EX485LNK, 2.18 Status BFM#28 (the table; the text below it is of another module)
 EX485LNK_STATUS = {
     1: "send completion",

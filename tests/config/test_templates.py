@@ -320,6 +320,8 @@ def shipped(folder: Path, use: str, device: str) -> dict[str, Tag]:
 
 
 VIGOR = "protocol: vigor, station: 1"
+K120S = "protocol: modbus-rtu, addressing: k120s, station: 1"
+DEVICES = {"liyan": "protocol: computer-link, station: 1", "k120s": K120S}
 
 
 @pytest.mark.parametrize(
@@ -330,12 +332,15 @@ VIGOR = "protocol: vigor, station: 1"
         ("vigor/rs", manual.RS),
         ("vigor/modem", manual.MODEM),
         ("vigor/cp2", {"D9121": "station number"}),
+        ("vigor/display", manual.DISPLAY),
+        ("liyan/computer-link", manual.LIYAN),
+        ("k120s/flags", manual.K120S_FLAGS),
     ],
 )
 def test_relays_and_registers_are_those_of_the_manual(
     tmp_path: Path, use: str, expected: dict[str, str]
 ) -> None:
-    found = shipped(tmp_path, use, VIGOR)
+    found = shipped(tmp_path, use, DEVICES.get(use.partition("/")[0], VIGOR))
     assert set(found) == set(expected)
     for address, words in expected.items():
         text = f"{found[address].name} {found[address].label.description}".lower().replace("-", " ")
@@ -387,12 +392,14 @@ def parts(folder: Path, use: str, device: str) -> dict[str, tuple[str, dict[int,
     }
 
 
-def test_codes_have_the_words_of_the_manual(tmp_path: Path) -> None:
-    def same(found: dict[int, str], expected: dict[int, str]) -> bool:
-        return found.keys() == expected.keys() and all(
-            words in found[code] for code, words in expected.items()
-        )
+def same(found: dict[int, str], expected: dict[int, str]) -> bool:
+    """True if all numbers have their words."""
+    return found.keys() == expected.keys() and all(
+        words in found[code].lower() for code, words in expected.items()
+    )
 
+
+def test_codes_have_the_words_of_the_manual(tmp_path: Path) -> None:
     link = parts(tmp_path, "vigor/cpu-link", VIGOR)
     for slave in range(1, 8):
         address, names = link[f"cpu-link/error-code/slave-{slave}"]
@@ -402,11 +409,26 @@ def test_codes_have_the_words_of_the_manual(tmp_path: Path) -> None:
         assert found[f"{use}/status"][0] == found[f"{use}/station"][0] == "D100"
         assert same(found[f"{use}/status"][1], manual.LINK_CODES)
         assert found[f"{use}/done"][0] == "M9199"
-    k120s = "protocol: modbus-rtu, addressing: k120s, station: 1, status: D0110"
-    modcom = parts(tmp_path, "k120s/modcom", k120s)
-    assert (modcom["modcom/done"][0], modcom["modcom/error"][0]) == ("D0110.0", "D0110.1")
-    assert modcom["modcom/code"][0] == "D0110"
-    assert same(modcom["modcom/code"][1], manual.MODCOM_CODES)
+    for name, codes in (("modcom", manual.MODCOM_CODES), ("dsnd", manual.DSND_CODES)):
+        found = parts(tmp_path, f"k120s/{name}", f"{K120S}, status: D0110")
+        assert (found[f"{name}/done"][0], found[f"{name}/error"][0]) == ("D0110.0", "D0110.1")
+        assert found[f"{name}/code"][0] == "D0110"
+        assert same(found[f"{name}/code"][1], codes)
+    display = parts(tmp_path, "vigor/display", VIGOR)
+    assert same(display["display/mode"][1], manual.DISPLAY_MODES)
+    link = parts(tmp_path, "liyan/computer-link", DEVICES["liyan"])
+    assert same(link["computer-link/error-code"][1], manual.LIYAN_CODES)
+    module = parts(tmp_path, "vigor/vb-1com", f"{VIGOR}, status: 28, error: 29")
+    assert module["vb-1com/error-code"][0] == "D29"
+    assert same(module["vb-1com/error-code"][1], manual.VB_1COM_CODES)
+
+
+def test_the_status_of_drcv_has_the_length_of_the_frame(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    device = f"{{use: k120s/drcv, {K120S}, status: M010}}"
+    path.write_text(f"lines: {{hall: {{port: simulator, devices: {{p: {device}}}}}}}\n")
+    found = {tag.name: tag.decode([0x0501]) for tag in load(path).devices[0].tags}
+    assert found == {"drcv/done": True, "drcv/error": False, "drcv/length": 5}
 
 
 def test_a_status_word_is_read_as_the_manual_divides_it(tmp_path: Path) -> None:
@@ -417,14 +439,16 @@ def test_a_status_word_is_read_as_the_manual_divides_it(tmp_path: Path) -> None:
     assert found == {"easy-link/status": 10, "easy-link/station": 7}
 
 
+def words_of_bits(found: dict[str, Tag]) -> dict[int, str]:
+    return {int(a.split(".")[1]): tag.label.description for a, tag in found.items() if "." in a}
+
+
 def test_ex485lnk(tmp_path: Path) -> None:
     link = "protocol: computer-link, station: 1, status: D0200, error: D0201"
     found = shipped(tmp_path, "ex485lnk/status", link)
-    words = {
-        int(a.split(".")[1]): tag.label.description.lower() for a, tag in found.items() if "." in a
-    }
-    assert words.keys() == manual.EX485LNK_STATUS.keys()
-    assert all(text in words[bit] for bit, text in manual.EX485LNK_STATUS.items())
+    assert same(words_of_bits(found), manual.EX485LNK_STATUS)
+    module = shipped(tmp_path, "vigor/vb-1com", f"{VIGOR}, status: 28, error: 29")
+    assert same(words_of_bits(module), manual.VB_1COM_STATUS)
     slave = "protocol: modbus-rtu, addressing: ex485lnk, station: 1, read: 0, written: 10"
     assert set(shipped(tmp_path, "ex485lnk/slave", f"{slave}, read_words: 2")) == {
         "holding:0",

@@ -9,7 +9,7 @@ import zenoh
 
 from gateway.cli.client.arguments import parse_value
 from gateway.cli.terminal import printable
-from gateway.values import Kind, Value
+from gateway.values import Value
 
 if TYPE_CHECKING:
     from gateway.tags import Tag
@@ -35,7 +35,7 @@ def raw(tag: "Tag", sample: zenoh.Sample, about: bytes) -> dict[str, object]:
     value: Value | None = None
     if sample.kind == zenoh.SampleKind.PUT:
         text = sample.payload.to_bytes().decode("utf-8", "replace")
-        value = text if tag.layout.type.kind is Kind.STRING else parse_value(text)
+        value = text if tag.layout.type.is_text else parse_value(text)
     return {"value": value, **document(about)}
 
 

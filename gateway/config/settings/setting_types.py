@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, Wrap
 
 from gateway.config.settings import parsers
 from gateway.transport.port import PortAddress
-from gateway.values import BYTES, Kind, Order
+from gateway.values import NO_ELEMENTS, Kind, Order
 
 DURATION_SCHEMA: dict[str, Any] = {
     "type": "string",
@@ -30,7 +30,7 @@ FORMAT_SCHEMA = {
     ]
 }
 _KINDS = [kind.value for kind in Kind if kind is not Kind.STRING]
-_ARRAYS = "|".join(kind for kind in _KINDS if kind not in BYTES)
+_ARRAYS = "|".join(kind for kind in _KINDS if kind not in NO_ELEMENTS)
 TYPE_SCHEMA = {
     "anyOf": [
         {"type": "string", "enum": _KINDS},

@@ -58,6 +58,7 @@ _TYPES = {
     "float64": "float64 double lreal f64 float[doubleprecision]",
     "bcd16": "bcd16 bcd",
     "bcd32": "bcd32 lbcd",
+    "telephone": "telephone",
     "": "default standard",
 }
 _KINDS = {spelling: kind for kind, row in _TYPES.items() for spelling in row.split()}

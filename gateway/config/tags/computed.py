@@ -103,7 +103,7 @@ class _Maker:
 
     def _input(self, key: str, way: tuple[str, ...]) -> Tag | None:
         tag = self.names.tags.get(key) or self.make(self.names.sources[key], way)
-        if tag is not None and tag.layout.type.kind is Kind.STRING:
+        if tag is not None and tag.layout.type.is_text:
             raise ConfigError(f"{key} is a text: only numbers and bits can be calculated")
         if tag is not None and tag.layout.type.count:
             raise ConfigError(f"{key} is an array: only single numbers and bits can be calculated")

@@ -53,7 +53,7 @@ def _check(own: Any, facts: Facts) -> Iterator[Problem]:
         )
     if kind.kind in BYTES and "byte_order" in given:
         yield "byte_order", f"{facts.text} is one byte: write byte: low or byte: high"
-    elif kind.kind is Kind.BOOL and "byte_order" in given:
+    elif kind.kind in (Kind.BOOL, Kind.TELEPHONE) and "byte_order" in given:
         yield "byte_order", f"{facts.text} is {kind}: only words have a byte_order"
     if own.byte is not None and kind.kind not in BYTES:
         yield "byte", f"a {kind} has whole words: byte needs type: uint8 or int8"

@@ -101,7 +101,7 @@ def _check(own: Any, facts: Facts) -> Iterator[Problem]:
 
 
 def _enum_misfits(own: Any, names: Names, kind: ValueType, *, scaled: bool) -> Iterator[Problem]:
-    if kind.kind is Kind.STRING or kind.is_float:
+    if kind.is_text or kind.is_float:
         yield "enum", f"a {kind} has no enum: only bits and whole numbers have"
     elif scaled:
         yield "enum", "an enum names the numbers of the device: remove scale, offset, from and to"
