@@ -49,8 +49,8 @@ def scan(number: int) -> list[Sample]:
 
 
 def until(historian: Historian, **wanted: object) -> dict[str, Any]:
-    """Waits at most 10 s until the status has these values."""
-    for _ in range(1000):
+    """Waits at most a minute until the status has these values."""
+    for _ in range(6000):
         document = dict(historian.document())
         if all(document[name] == value for name, value in wanted.items()):
             return document
@@ -90,7 +90,7 @@ def full(historian: Historian, path: Path) -> None:
 
 
 def readonly(historian: Historian, path: Path) -> None:
-    for _ in range(1000):
+    for _ in range(6000):
         trouble = historian.document()
         if trouble["state"] not in ("ok", "not opened yet"):
             break

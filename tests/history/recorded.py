@@ -14,7 +14,7 @@ from gateway.contract import payload
 from gateway.contract.payload import WriteOutcome
 from gateway.parts.history.answers.recent import SortedRun
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.store.file import HistoryFile
+from gateway.parts.history.store.file import HistoryFile, oldest
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value
 from tests.history_writer import WEEK, tag, until
@@ -36,7 +36,7 @@ def history(
         until(historian, state="ok")
         yield historian
     finally:
-        assert historian.close(10)
+        assert historian.close(60)
 
 
 def record_outcome(historian: Historian, outcome: WriteOutcome, *, refused: bool = False) -> None:
@@ -70,6 +70,12 @@ def all_runs(file: HistoryFile) -> list[SortedRun]:
 def closed_runs(path: Path) -> list[tuple[int, int]]:
     with closing(sqlite3.connect(path)) as database:
         return list(database.execute("SELECT id, samples FROM run ORDER BY id"))
+
+
+def oldest_in_file(path: Path) -> int:
+    """Returns the number of the oldest sample that the file still has."""
+    with closing(sqlite3.connect(path)) as database:
+        return oldest(database)
 
 
 def write(number: int) -> WriteOutcome:

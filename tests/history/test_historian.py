@@ -29,6 +29,7 @@ from tests.history.recorded import (
     closed_runs,
     history,
     numbered,
+    oldest_in_file,
     record_outcome,
     values,
     write,
@@ -208,14 +209,15 @@ def test_an_answer_begins_with_the_oldest_sample_that_is_left(
 
     def late(reader: Reader, *arguments: Any) -> tuple[list[Row], bool] | None:
         monkeypatch.undo()
-        first = historian.document()["oldest"]
+        first = oldest_in_file(path)
         for start in range(20_000, 60_000, 1000):
-            if historian.document()["oldest"] == first:
+            if oldest_in_file(path) == first:
                 flooded(historian, start, start + 1000)
         rows: tuple[list[Row], bool] | None = at_once(reader, *arguments)
         return rows
 
-    with history(tmp_path / "h.db", max_size=SMALL) as historian:
+    path = tmp_path / "h.db"
+    with history(path, max_size=SMALL) as historian:
         flooded(historian, 0, 20_000)
         monkeypatch.setattr(Reader, "rows", late)
         found = values(historian)

@@ -170,7 +170,7 @@ def test_a_link_to_itself_is_reported_and_tried_again(tmp_path: Path) -> None:
     historian.record(numbered(5))
     path.unlink()
     until(historian, state="ok", waiting=0)
-    assert historian.close(10)
+    assert historian.close(60)
 
 
 def test_a_database_of_another_program_is_moved_aside_untouched(tmp_path: Path) -> None:
