@@ -9,24 +9,11 @@ from typing import Any
 from gateway.config.line_rules import check_line, line_wire, modem_of
 from gateway.config.messages import Mistakes, Path, meant, shown
 from gateway.config.settings import parsers
-from gateway.config.settings.model import (
-    DeviceSection,
-    FileSection,
-    LineSection,
-)
-from gateway.config.settings.records import (
-    Config,
-    LineConfig,
-)
+from gateway.config.settings.model import DeviceSection, LineSection
+from gateway.config.settings.records import Config, LineConfig
 from gateway.config.settings.sections import Place, file_section, placed
 from gateway.config.settings.session_files import existing_file, with_files
-from gateway.config.settings.validate import (
-    driver_of,
-    driver_settings,
-    protocols,
-    section,
-    unknown,
-)
+from gateway.config.settings.validate import driver_of, driver_settings, protocols, section, unknown
 from gateway.config.sheets.tags import SheetTags
 from gateway.config.tags.arrays import check_overlaps
 from gateway.config.tags.computed import check_totals, with_computed
@@ -45,13 +32,14 @@ from gateway.config.tags.served import (
 from gateway.config.transfers.rows import TransferRows
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
-from gateway.protocols.driver import AnyDriver, Timing
+from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS
 from gateway.transport.port import ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
 WRITERS_STATE = FilePath("writers.json")
+_TIMES = ("reply_timeout", "turnaround", "silence", "retries")  # a device may have its own
 
 
 @dataclass(slots=True)
@@ -97,19 +85,20 @@ class Builder:
         lines, transfers = rows.build(data.get("transfers"))
         if top is None:
             return None
-        check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
+        state_file = self._kept(top.gateway.state, STATE_FILE)
+        check_retained(lines, state_file, top.gateway.standby, self.mistakes)
         place = Place(
             self.mistakes,
             self.folder,
             self.state_folder,
-            self._state_file(top),
+            state_file,
             [tag for line in lines for tag in line.tags],
             self._tags.recorded or self._sheets.recorded,
         )
         return Config(
             name=top.gateway.name,
-            state_file=self._state_file(top),
-            audit_file=self._audit_file(top),
+            state_file=state_file,
+            audit_file=self._kept(top.gateway.audit, AUDIT_FILE),
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
@@ -200,20 +189,19 @@ class Builder:
             only_served(raw, path, self.mistakes)
             check_overlaps(driver, tags, (*path, "tags"), self.mistakes)
         default = driver.timing
-        timing = Timing(
-            reply_timeout=_either(settings.reply_timeout, default.reply_timeout),
-            turnaround=_either(settings.turnaround, default.turnaround),
-            silence=_either(settings.silence, default.silence),
-            silence_chars=default.silence_chars,
-            retries=default.retries if settings.retries is None else settings.retries,
+        own_times = {name: getattr(settings, name) for name in _TIMES}
+        timing = replace(
+            default,
+            **{name: given for name, given in own_times.items() if given is not None},
             learn_silence=default.learn_silence and settings.silence is None,
         )
+        late_guard = settings.late_guard
         return DeviceSettings(
             name=name,
             driver=driver,
             timing=timing,
             turnaround=settings.turnaround,
-            late_guard=_either(settings.late_guard, timing.reply_timeout),
+            late_guard=timing.reply_timeout if late_guard is None else late_guard,
             verify_reads=settings.verify_reads,
             blocks=settings.blocks,
             control=settings.control,
@@ -275,22 +263,12 @@ class Builder:
         """Returns the path of a file that the gateway writes."""
         return (self.state_folder or self.folder) / name
 
-    def _state_file(self, top: FileSection) -> FilePath | None:
-        name = top.gateway.state
+    def _kept(self, name: FilePath | None, usual: FilePath) -> FilePath | None:
+        """Returns the path of a file that is kept: named in the file, or in the state folder."""
         if name is None and self.state_folder is not None:
-            name = STATE_FILE
-        return None if name is None else self._written(name)
-
-    def _audit_file(self, top: FileSection) -> FilePath | None:
-        name = top.gateway.audit
-        if name is None and self.state_folder is not None:
-            name = AUDIT_FILE
+            name = usual
         return None if name is None else self._written(name)
 
 
 def _devices_of(raw: object) -> object:
     return raw.get("devices") if isinstance(raw, dict) else None
-
-
-def _either(own: float | None, default: float) -> float:
-    return default if own is None else own

@@ -190,16 +190,13 @@ def modem_of(
         mistakes.add((*place, "number"), text)
     found = found or ModemSection()
     usual = ANSWERS_IDLE if line.serve else DIALS_IDLE
-    return ModemSettings(
-        number=number or "",
-        init=found.init,
-        dial_timeout=found.dial_timeout,
-        tries=found.tries,
-        retry_pause=found.retry_pause,
-        idle=usual if found.idle is None else found.idle,
-        guard=found.guard,
-        hold=_TEXT * wire.character + _LATE,
-    )
+    own = {
+        **dict(found),
+        "number": number or "",
+        "idle": usual if found.idle is None else found.idle,
+        "hold": _TEXT * wire.character + _LATE,
+    }
+    return ModemSettings(**own)
 
 
 def line_wire(

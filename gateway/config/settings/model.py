@@ -6,11 +6,7 @@ device does not have, two stations with one number) are found by `gateway.config
 
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    PlainValidator,
-    WithJsonSchema,
-)
+from pydantic import Field
 
 from gateway.config.settings import parsers
 from gateway.config.settings.modem_settings import ModemSection
@@ -21,6 +17,7 @@ from gateway.config.settings.setting_types import (
     Duration,
     FilePath,
     Interval,
+    Parsed,
     Port,
     Text,
 )
@@ -49,9 +46,7 @@ class DeviceSection(Section):
     late_guard: Duration | None = None
     """The longest wait for a late reply after a time-out, before the next request."""
     blocks: Annotated[
-        bool | Literal["only"],
-        PlainValidator(parsers.blocks),
-        WithJsonSchema({"enum": [True, False, "only"]}),
+        bool | Literal["only"], Parsed(parsers.blocks, {"enum": [True, False, "only"]})
     ] = False
     """One put per scan with all changed tags, at <device>/@block: true adds it, only replaces."""
     control: bool = False
@@ -76,9 +71,7 @@ class LineSection(Section):
     """A serial port, tcp://host:port, rfc2217://host:port, modem:<one of these>, or simulator."""
     baudrate: Baudrate = None
     """Speed of the line, also behind a device server; left out: the default of the protocol."""
-    format: Annotated[
-        str | None, PlainValidator(parsers.serial_format), WithJsonSchema(FORMAT_SCHEMA)
-    ] = None
+    format: Annotated[str | None, Parsed(parsers.serial_format, FORMAT_SCHEMA)] = None
     """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
     echo: bool | None = None
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""

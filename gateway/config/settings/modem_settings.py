@@ -3,10 +3,10 @@
 import re
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field
 
 from gateway.config.messages import shown
-from gateway.config.settings.setting_types import Interval
+from gateway.config.settings.setting_types import Interval, Parsed
 from gateway.errors import ConfigError
 
 # The rest are signs between digits; `,` is a pause and W a wait for the dial tone.
@@ -51,15 +51,12 @@ class ModemSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
 
     number: Annotated[
-        str | None,
-        PlainValidator(phone_number),
-        WithJsonSchema({"type": "string", "pattern": _NUMBER_PATTERN}),
+        str | None, Parsed(phone_number, {"type": "string", "pattern": _NUMBER_PATTERN})
     ] = None
     """The telephone number of the PLCs, in quotes; a modem that only answers has none."""
     init: Annotated[
         tuple[str, ...],
-        PlainValidator(init_strings),
-        WithJsonSchema({"anyOf": [_INIT_SCHEMA, {"type": "array", "items": _INIT_SCHEMA}]}),
+        Parsed(init_strings, {"anyOf": [_INIT_SCHEMA, {"type": "array", "items": _INIT_SCHEMA}]}),
     ] = ("ATZ",)
     """Commands that set the modem up, one or a list."""
     dial_timeout: Interval = 60.0

@@ -15,7 +15,7 @@ from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
 from gateway.files import is_name
 from gateway.transport.port import MODEM, PortAddress, SerialPath, parse_port
-from gateway.values import Order, ValueType, parse_type
+from gateway.values import ValueType, parse_type
 
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
 _COMMA = re.compile(r"-?[0-9]+,[0-9]+ ?[A-Za-zµ%]*\Z")
@@ -232,12 +232,6 @@ def serial_format(text: object) -> str:
 
 def value_type(text: object) -> ValueType:
     return parse_type(_text(text))
-
-
-def order(text: object) -> Order:
-    if text not in list(Order):
-        raise ConfigError(f"{shown(text)} is no order: use {one_of(Order)}")
-    return Order(str(text))
 
 
 def blocks(value: object) -> bool | Literal["only"]:

@@ -20,11 +20,7 @@ class Section(BaseModel):
     """Settings of one kind; any other setting is a mistake."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        strict=True,
-        arbitrary_types_allowed=True,
-        defer_build=True,
+        extra="forbid", frozen=True, strict=True, arbitrary_types_allowed=True, defer_build=True
     )
 
 

@@ -1,13 +1,45 @@
 """Types of single settings for pydantic and for editors: durations, names, files, endpoints."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, WrapValidator
+from pydantic import AfterValidator, Field, WithJsonSchema, WrapValidator
+from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
+from gateway.config.messages import one_of, shown
 from gateway.config.settings import parsers
+from gateway.errors import ConfigError
 from gateway.transport.port import PortAddress
 from gateway.values import NO_ELEMENTS, Kind, Order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parsed:
+    """A setting with a parser of its own. `schema`: what an editor accepts."""
+
+    parse: Callable[[Any], object]
+    schema: dict[str, Any]
+
+    def __get_pydantic_core_schema__(self, _kind: Any, _handler: Any) -> CoreSchema:
+        return no_info_plain_validator_function(self.parse)
+
+    def __get_pydantic_json_schema__(self, _core: Any, _handler: Any) -> dict[str, Any]:
+        return dict(self.schema)
+
+
+def member(kind: type[StrEnum], wrong: str = "is not known") -> Parsed:
+    """Returns the setting that is a member of an enumeration."""
+
+    def parse(text: object) -> StrEnum:
+        if text not in list(kind):
+            raise ConfigError(f"{shown(text)} {wrong}: use {one_of(kind)}")
+        return kind(str(text))
+
+    return Parsed(parse, {"type": "string", "enum": [one.value for one in kind]})
+
 
 DURATION_SCHEMA: dict[str, Any] = {
     "type": "string",
@@ -38,19 +70,12 @@ TYPE_SCHEMA = {
         {"type": "string", "pattern": rf"^({_ARRAYS})\[0*([1-9][0-9]{{0,2}}|1[0-9]{{3}}|2000)\]$"},
     ]
 }
-DEADBAND_SCHEMA = {
-    "anyOf": [
-        {"type": "number", "minimum": 0},
-        {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?%$"},
-    ]
-}
 SCALE_SCHEMA = {"type": "number", "not": {"const": 0}}
 _ENDPOINT_SCHEMA = {
     "type": "string",
     "pattern": r"^[a-z][a-z0-9_-]*/[^\s/]\S*$",
     "examples": ["tcp/127.0.0.1:7447"],
 }
-_ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
 _HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+)"
 _PORT_SCHEMA = {
     "type": "string",
@@ -67,39 +92,32 @@ _PORT_SCHEMA = {
     ],
 }
 
-Duration = Annotated[float, PlainValidator(parsers.duration), WithJsonSchema(DURATION_SCHEMA)]
-Interval = Annotated[float, PlainValidator(parsers.interval), WithJsonSchema(INTERVAL_SCHEMA)]
+Duration = Annotated[float, Parsed(parsers.duration, DURATION_SCHEMA)]
+Interval = Annotated[float, Parsed(parsers.interval, INTERVAL_SCHEMA)]
 Text = Annotated[str, Field(strict=True), WithJsonSchema(TEXT_SCHEMA)]
-Name = Annotated[
-    str, PlainValidator(parsers.name), WithJsonSchema(TEXT_SCHEMA | {"pattern": NAME_PATTERN})
-]
-Group = Annotated[
-    str, PlainValidator(parsers.name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
-]
+Name = Annotated[str, Parsed(parsers.name, TEXT_SCHEMA | {"pattern": NAME_PATTERN})]
+Group = Annotated[str, Parsed(parsers.name, {"type": "string", "pattern": NAME_PATTERN})]
 Prefix = Annotated[
-    str,
-    PlainValidator(parsers.prefix),
-    WithJsonSchema(TEXT_SCHEMA | {"pattern": f"^{_CHUNK}(/{_CHUNK})*$"}),
+    str, Parsed(parsers.prefix, TEXT_SCHEMA | {"pattern": f"^{_CHUNK}(/{_CHUNK})*$"})
 ]
-Port = Annotated[PortAddress, PlainValidator(parsers.port), WithJsonSchema(_PORT_SCHEMA)]
+Port = Annotated[PortAddress, Parsed(parsers.port, _PORT_SCHEMA)]
 Baudrate = Annotated[
-    int | None,
-    PlainValidator(parsers.baudrate),
-    WithJsonSchema({"type": "integer", "enum": list(parsers.BAUDRATES)}),
+    int | None, Parsed(parsers.baudrate, {"type": "integer", "enum": list(parsers.BAUDRATES)})
 ]
 WebAddress = Annotated[
     tuple[str, int],
-    PlainValidator(parsers.web_address),
-    WithJsonSchema({"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
+    Parsed(parsers.web_address, {"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
 ]
 HostName = Annotated[
     str,
-    PlainValidator(parsers.host_name),
-    WithJsonSchema({"type": "string", "pattern": r"^[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?$"}),
+    Parsed(
+        parsers.host_name,
+        {"type": "string", "pattern": r"^[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?$"},
+    ),
 ]
-FilePath = Annotated[Path, PlainValidator(parsers.path), WithJsonSchema({"type": "string"})]
-OrderName = Annotated[Order, PlainValidator(parsers.order), WithJsonSchema(_ORDER_SCHEMA)]
-Endpoint = Annotated[str, PlainValidator(parsers.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
+FilePath = Annotated[Path, Parsed(parsers.path, {"type": "string"})]
+OrderName = Annotated[Order, member(Order, "is no order")]
+Endpoint = Annotated[str, Parsed(parsers.endpoint, _ENDPOINT_SCHEMA)]
 Endpoints = Annotated[list[Endpoint], AfterValidator(parsers.once)]
 Distance = Annotated[
     float,

@@ -2,12 +2,12 @@
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from gateway.config.messages import shown
 from gateway.config.settings import parsers
 from gateway.config.settings.session_model import Section
-from gateway.config.settings.setting_types import SCALE_SCHEMA, Finite, Interval, Text
+from gateway.config.settings.setting_types import SCALE_SCHEMA, Finite, Interval, Parsed, Text
 from gateway.errors import ConfigError
 from gateway.values import Value
 
@@ -57,9 +57,7 @@ class TransferSection(Section):
     """carried value = value of the source x scale + offset"""
     stale: Interval | None = None
     """A value whose last read is older is not carried; left out: 5s, or three intervals of it."""
-    if_stale: Annotated[
-        Value | None, PlainValidator(_if_stale), WithJsonSchema(_IF_STALE_SCHEMA)
-    ] = None
+    if_stale: Annotated[Value | None, Parsed(_if_stale, _IF_STALE_SCHEMA)] = None
     """The source is too old: skip writes nothing, {write: 0} writes this value once."""
 
     @model_validator(mode="after")

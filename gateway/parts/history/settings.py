@@ -4,12 +4,10 @@ from os.path import realpath
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import PlainValidator, WithJsonSchema
-
 from gateway.config.settings import parsers
 from gateway.config.settings.sections import PartSection, Place, Written
 from gateway.config.settings.session_model import Section
-from gateway.config.settings.setting_types import FilePath, Interval
+from gateway.config.settings.setting_types import FilePath, Interval, Parsed
 
 _TAILS = ("", "-wal", "-shm", "-journal", ".lock")  # SQLite's files, and the lock
 
@@ -22,9 +20,7 @@ class HistorySection(Section):
     keep: Interval = 7 * 86400.0
     """Older samples are deleted."""
     max_size: Annotated[
-        int,
-        PlainValidator(parsers.size),
-        WithJsonSchema({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"}),
+        int, Parsed(parsers.size, {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"})
     ] = 10**9
     """The oldest samples are deleted when the file grows beyond this size."""
 

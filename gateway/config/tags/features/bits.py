@@ -3,9 +3,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
-from pydantic import PlainValidator, WithJsonSchema
-
 from gateway.config.messages import Mistakes, Path
+from gateway.config.settings.setting_types import Parsed
 from gateway.config.tags.features import shaping_parsers
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings
 from gateway.errors import ConfigError
@@ -22,9 +21,7 @@ Rows = Iterator[tuple[str, object, Path]]
 
 
 class BitsSettings(Settings):
-    bits: Annotated[
-        dict[int, Any] | None, PlainValidator(shaping_parsers.bits), WithJsonSchema(_SCHEMA)
-    ] = None
+    bits: Annotated[dict[int, Any] | None, Parsed(shaping_parsers.bits, _SCHEMA)] = None
     """One tag for each named bit of the word, instead of the word: {0: pump, 3: fault}."""
 
 

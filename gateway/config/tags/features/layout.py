@@ -3,11 +3,8 @@
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import PlainValidator, WithJsonSchema
-
 from gateway.config.settings import parsers
-from gateway.config.settings.setting_types import TYPE_SCHEMA, OrderName
-from gateway.config.tags.features import shaping_parsers
+from gateway.config.settings.setting_types import TYPE_SCHEMA, OrderName, Parsed, member
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings
 from gateway.protocols.driver import Address, Addressing, Area, Unit
 from gateway.values import BYTES, Byte, Kind, Layout, Order, ValueType
@@ -17,9 +14,7 @@ _OF_WORDS = ("type", "word_order", "byte_order", "byte")
 
 
 class LayoutSettings(Settings):
-    type: Annotated[
-        ValueType | None, PlainValidator(parsers.value_type), WithJsonSchema(TYPE_SCHEMA)
-    ] = None
+    type: Annotated[ValueType | None, Parsed(parsers.value_type, TYPE_SCHEMA)] = None
     """The type of the value, or of the elements of an array such as uint16[50]; left out: bool for
     a bit, a whole number otherwise."""
     word_order: OrderName = Order.LOW_FIRST
@@ -29,11 +24,7 @@ class LayoutSettings(Settings):
 
 
 class ByteSettings(Settings):
-    byte: Annotated[
-        Byte | None,
-        PlainValidator(shaping_parsers.byte),
-        WithJsonSchema({"type": "string", "enum": ["low", "high"]}),
-    ] = None
+    byte: Annotated[Byte | None, member(Byte, "is no byte of a word")] = None
     """The byte of the word that a uint8 or int8 has; left out: the low one."""
 
 

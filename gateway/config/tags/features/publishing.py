@@ -6,10 +6,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import PlainValidator, WithJsonSchema
-
-from gateway.config.messages import one_of, shown
-from gateway.config.settings.setting_types import Interval
+from gateway.config.messages import shown
+from gateway.config.settings.setting_types import Interval, Parsed, member
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings, for_numbers
 from gateway.errors import ConfigError
 from gateway.tags import Deadband, Form, Publish, Publishing, Tag
@@ -37,36 +35,16 @@ def _deadband(text: object) -> Deadband:
     return Deadband(float(match[1]), percent=True)
 
 
-def _publish(text: object) -> Publish:
-    if text not in list(Publish):
-        raise ConfigError(f"{shown(text)} is not known: use {one_of(Publish)}")
-    return Publish(str(text))
-
-
-def _form(text: object) -> Form:
-    if text not in list(Form):
-        raise ConfigError(f"{shown(text)} is not known: use {one_of(Form)}")
-    return Form(str(text))
-
-
 class PublishingSettings(Settings):
-    deadband: Annotated[
-        Deadband | None, PlainValidator(_deadband), WithJsonSchema(_DEADBAND_SCHEMA)
-    ] = None
+    deadband: Annotated[Deadband | None, Parsed(_deadband, _DEADBAND_SCHEMA)] = None
     """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
-    publish: Annotated[
-        Publish,
-        PlainValidator(_publish),
-        WithJsonSchema({"type": "string", "enum": ["change", "always"]}),
-    ] = Publish.CHANGE
+    publish: Annotated[Publish, member(Publish)] = Publish.CHANGE
     """Publish when the value changes, or every value that is read."""
     heartbeat: Interval | None = None
     """Publish at least this often, changed or not."""
     history: bool = False
     """Store the values on disk."""
-    payload: Annotated[
-        Form, PlainValidator(_form), WithJsonSchema({"type": "string", "enum": ["json", "raw"]})
-    ] = Form.JSON
+    payload: Annotated[Form, member(Form)] = Form.JSON
     """json: value, quality and time; raw: the bare value as text."""
 
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from gateway.config.messages import shown
 from gateway.config.settings import parsers
-from gateway.config.settings.setting_types import SCALE_SCHEMA, Finite
+from gateway.config.settings.setting_types import SCALE_SCHEMA, Finite, Parsed
 from gateway.config.tags.features import shaping_parsers
 from gateway.config.tags.features.feature import (
     Facts,
@@ -37,9 +37,7 @@ _ENUM_SCHEMA = {
     "additionalProperties": {"type": "string"},
     "minProperties": 1,
 }
-_Pair = Annotated[
-    tuple[float, float], PlainValidator(shaping_parsers.pair), WithJsonSchema(_PAIR_SCHEMA)
-]
+_Pair = Annotated[tuple[float, float], Parsed(shaping_parsers.pair, _PAIR_SCHEMA)]
 
 
 class ScalingSettings(Settings):
@@ -53,9 +51,7 @@ class ScalingSettings(Settings):
     """The values of the tag at the two ends of `from`, such as [0, 100]; instead of scale."""
     decimals: Annotated[int, Field(ge=0, le=15)] | None = None
     """A read is rounded to so many decimals, and so is a write."""
-    clamp: Annotated[
-        Bounds | None, PlainValidator(shaping_parsers.clamp), WithJsonSchema(_CLAMP_SCHEMA)
-    ] = None
+    clamp: Annotated[Bounds | None, Parsed(shaping_parsers.clamp, _CLAMP_SCHEMA)] = None
     """A read outside is shown as the nearest end, such as [0, 100] or [0, null]."""
 
     @model_validator(mode="after")
@@ -69,9 +65,7 @@ class ScalingSettings(Settings):
 
 
 class ShapingSettings(Settings):
-    enum: (
-        Annotated[Names, PlainValidator(shaping_parsers.names), WithJsonSchema(_ENUM_SCHEMA)] | None
-    ) = None
+    enum: Annotated[Names, Parsed(shaping_parsers.names, _ENUM_SCHEMA)] | None = None
     """Names of the values, such as {0: off, 1: auto}; a write takes the number or the name."""
     invert: bool = False
     """The bit is shown and written the other way round."""

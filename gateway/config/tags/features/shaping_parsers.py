@@ -7,7 +7,6 @@ from typing import Any
 from gateway.config.messages import shown
 from gateway.errors import ConfigError
 from gateway.tags.shaping import Bounds, Names
-from gateway.values import Byte
 
 _WHOLE = re.compile(r"-?[0-9]{1,20}\Z")
 _NUMBER = re.compile(r"[-+]?[0-9.]+\Z")
@@ -78,9 +77,3 @@ def bits(value: object) -> dict[int, str | dict[str, Any]]:
             raise ConfigError(f"bit {key} has no name: write {key}: pump, or {key}: {{name: pump}}")
         found[int(key)] = entry
     return found
-
-
-def byte(value: object) -> Byte:
-    if value not in list(Byte):
-        raise ConfigError(f"{shown(value)} is no byte of a word: use low or high")
-    return Byte(str(value))
