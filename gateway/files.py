@@ -1,7 +1,8 @@
-"""Files that people write: read without waiting, whatever they are, and never without a limit."""
+"""Files: read without waiting, whatever they are, and never without a limit; written whole."""
 
 import os
 import stat
+from contextlib import suppress
 from errno import EFBIG, EINVAL
 from pathlib import Path
 
@@ -27,6 +28,23 @@ def read(path: Path, most: int = MOST) -> bytes:
     if found.st_size > most or len(data) > most:
         raise OSError(EFBIG, f"it has more than {most // 2**20} MB")
     return data
+
+
+def append(file: int, data: bytes, *, sync: bool = False) -> None:
+    """Appends all of the data to an open file, or nothing: a full disk takes a part.
+
+    `sync`: returns when it is on the disk. Raises `OSError`.
+    """
+    size, rest = os.fstat(file).st_size, memoryview(data)
+    try:
+        while rest:
+            rest = rest[os.write(file, rest) :]
+        if sync:
+            os.fsync(file)
+    except OSError:
+        with suppress(OSError):
+            os.ftruncate(file, size)
+        raise
 
 
 def is_file(path: Path) -> bool:

@@ -90,14 +90,18 @@ def notes(line: LineConfig) -> list[str]:
 
 def shown(event: dict[str, Any]) -> str:
     """Returns one event as a line for people, with the local time."""
-    at = event["time"]
-    clock = time.strftime("%H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]
+    at = clock(event["time"])
     if "way" in event:
-        return f"{clock}   {event['way']} {event['bytes']}"
+        return f"{at}   {event['way']} {event['bytes']}"
     text = f"{event['device']}: {event['what']}"
     failed = "! " if event["failed"] else ""
     result = f"  {failed}{event['result']}" if event["result"] else ""
-    return f"{clock} {event['took'] * 1000:8.1f} ms  {text:{_WIDTH}}{result}".rstrip()
+    return f"{at} {event['took'] * 1000:8.1f} ms  {text:{_WIDTH}}{result}".rstrip()
+
+
+def clock(at: float) -> str:
+    """Returns the local time: `13:00:00.123`. `at`: seconds since 1970."""
+    return time.strftime("%H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]
 
 
 def _events(documents: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:

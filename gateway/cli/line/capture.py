@@ -10,6 +10,7 @@ from pathlib import Path
 from struct import pack, unpack
 from typing import Self
 
+from gateway import files
 from gateway.config import LineConfig
 from gateway.errors import GatewayError
 from gateway.protocols.capabilities import Dissected
@@ -92,13 +93,9 @@ class Capture:
         self._write(_block(_PACKET, head + _padded(pdu) + flags))
 
     def _write(self, data: bytes) -> None:
-        size = os.lseek(self._file, 0, os.SEEK_CUR)
         try:
-            written = 0
-            while written < len(data):
-                written += os.write(self._file, data[written:])
+            files.append(self._file, data)
         except OSError as error:
-            os.ftruncate(self._file, size)  # Wireshark refuses half a packet
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> GatewayError:

@@ -137,14 +137,21 @@ def one_device(options: Mapping[str, object], settings: Sequence[str]) -> Config
     known = PROTOCOLS.get(str(options["protocol"]))
     if known is not None and "format" in {one.name for one in fields(known.settings)}:
         device["format"] = options["format"]  # a station that is set so: `one_format`
-    for text in settings:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {text}: write NAME=VALUE, such as addressing=k120s")
-        device[name] = scalar(value)
+    device |= given_settings(settings, "addressing=k120s")
     given = {name: value for name, value in device.items() if value is not None}
     line = {name: value for name, value in line.items() if value is not None}
     return built({"lines": {"peek": {**line, "devices": {"peek": given}}}})
+
+
+def given_settings(texts: Sequence[str], example: str) -> dict[str, object]:
+    """Returns the settings of the option `--set`. Raises `ConfigError`."""
+    found: dict[str, object] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {text}: write NAME=VALUE, such as {example}")
+        found[name] = scalar(value)
+    return found
 
 
 def _only(config: Config, name: str) -> Config:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from gateway.cli.line.peek import given_settings
 from gateway.cli.trace import line_named
 from gateway.config import LineConfig, built, load
 from gateway.config.settings.validate import driver_settings
@@ -82,7 +83,7 @@ def line_of_protocols(log: Log, protocols: Sequence[str], settings: Sequence[str
     protocols = protocols or log.protocols()
     if not protocols:
         raise ConfigError("the recording names no protocol: name it with --protocol, or --config")
-    given = dict(_setting(text) for text in settings)
+    given = given_settings(settings, "frame_format=4")
     wire = log.wire()
     pieces = list(timed(log.entries()))
     devices: dict[str, Mapping[str, object]] = {}
@@ -102,13 +103,6 @@ def line_of_protocols(log: Log, protocols: Sequence[str], settings: Sequence[str
             "does --set lack a setting of the devices?"
         )
     return of_units(_built(devices, wire), pieces)
-
-
-def _setting(text: str) -> tuple[str, object]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise ConfigError(f"--set {text}: write NAME=VALUE, such as frame_format=4")
-    return name, scalar(value)
 
 
 def _built(devices: Mapping[str, object], wire: Mapping[str, object]) -> LineConfig:

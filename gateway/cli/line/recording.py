@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
+from gateway import files
 from gateway.errors import GatewayError
 
 FILES = 10  # of one recording: a tenth of it is deleted at once
@@ -58,13 +59,7 @@ class Recording:
     def _write(self, data: bytes) -> None:
         if self._file is None:
             raise AssertionError("no file is open")
-        written = 0
-        try:
-            while written < len(data):  # a disk that is nearly full takes a part
-                written += os.write(self._file, data[written:])
-        except OSError:
-            os.ftruncate(self._file, self._size)  # half a line would be read as a short one
-            raise
+        files.append(self._file, data)
         self._size += len(data)
 
     def _next(self) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +14,7 @@ from gateway.cli.line.peek import SettingOption
 from gateway.cli.line.recorded_line import Log, line_of_file, line_of_protocols
 from gateway.cli.line.replay_serve import serve
 from gateway.cli.terminal import FAILED, printable
+from gateway.cli.trace import clock
 from gateway.config import LineConfig
 from gateway.errors import ConfigError, GatewayError
 from gateway.line.exchanges import shown
@@ -97,9 +97,7 @@ def _compare(line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, chec
         if isinstance(event, Difference):
             at, tag, value = event.logged
             now = json.dumps(event.learned, ensure_ascii=False)
-            print(
-                f"{_clock(at)} {tag}: {json.dumps(value, ensure_ascii=False)} recorded, {now} now"
-            )
+            print(f"{clock(at)} {tag}: {json.dumps(value, ensure_ascii=False)} recorded, {now} now")
         elif not check:
             _print(event)
     checked = replayed.checked
@@ -123,11 +121,7 @@ def _lines(event: Learned) -> Iterator[str]:
     """Returns the good values of a reply, and each reason of bad ones."""
     good = [sample for sample in event.samples if sample.value is not None]
     if good:
-        yield f"{_clock(event.at)} {good[0].tag.device}: {shown(good)}"
+        yield f"{clock(event.at)} {good[0].tag.device}: {shown(good)}"
     for sample in event.samples:
         if sample.value is None:
-            yield f"{_clock(event.at)} {sample.tag.key}: bad, {sample.reason}: {sample.detail}"
-
-
-def _clock(at: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]
+            yield f"{clock(event.at)} {sample.tag.key}: bad, {sample.reason}: {sample.detail}"

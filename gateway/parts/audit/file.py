@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from gateway import files
 from gateway.parts.audit.chain import Event, Link, lines, link
 
 MOST = 10 * 2**20  # bytes of a file
@@ -26,19 +27,11 @@ class AuditFile:
         if not self._opened:
             self._open()
         data, last = lines(self.last, events)
-        size = self._size()
-        if size and size + len(data) > self._most:
+        if (size := self._size()) and size + len(data) > self._most:
             self._rotate()
-            size = 0
         number = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         try:
-            with open(number, "ab", closefd=False) as file:
-                file.write(data)
-            os.fsync(number)
-        except OSError:
-            with suppress(OSError):
-                os.ftruncate(number, size)
-            raise
+            files.append(number, data, sync=True)
         finally:
             os.close(number)
         self.last = last
