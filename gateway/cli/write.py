@@ -177,4 +177,5 @@ def outcome(target: str, answer: dict[str, object], *, held: bool = False) -> st
         how = "acknowledged and read back"
     elif answer.get("acknowledged") is False:
         how = "broadcast, without acknowledgement"
-    return f"{target} = {value_text(answer['value'])}: {how}, {took}"
+    note = f"; {answer['note']}" if "note" in answer else ""
+    return printable(f"{target} = {value_text(answer['value'])}: {how}, {took}{note}")

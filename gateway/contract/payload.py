@@ -281,14 +281,15 @@ def sample_fields(sample: Sample) -> dict[str, Value | None]:
 
 def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
     match result:
-        case WriteResult(known, time, took, verified, acknowledged):
-            return {
+        case WriteResult(known, time, took, verified, acknowledged, note):
+            fields: dict[str, Value | None] = {
                 "value": known,
                 "time": rfc3339(time),
                 "verified": verified,
                 "acknowledged": acknowledged,
                 "took": round(took, 6),
             }
+            return fields | {"note": note} if note else fields
         case Failure(problem, reason, code):
             return {"error": problem.value, "code": code, "reason": short(reason)}
 

@@ -10,6 +10,7 @@ from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
 from gateway.engine.device.turnaround import LEARN_EVERY
 from gateway.engine.jobs.unanswered import SEEN_FOR
+from gateway.engine.results.bit_writes import LACKED_FOR
 from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
 from gateway.engine.results.pipelining import TRY_AGAIN
 from gateway.planning.bad_addresses import RETRIES, SPLIT_LONGEST
@@ -112,6 +113,13 @@ BELIEFS = (
         "shorter waits only, for an hour",
         "the shorter wait",
         SEEN_FOR,
+    ),
+    Belief(
+        "does not change bits by itself",
+        "it refused function 22, or was silent about it before it did it, or twice",
+        "time: it is tried again",
+        "function 22 in place of reading and writing the word",
+        LACKED_FOR,
     ),
     Belief(
         "a device is busy",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from gateway.engine.device.device import Device
 from gateway.engine.device.records import LineRecord
 from gateway.engine.effects import Effects
+from gateway.engine.results.bit_writes import BitWrites
 from gateway.engine.results.broadcast_replies import BroadcastReplies
 from gateway.engine.results.busy_devices import BusyDevices
 from gateway.engine.results.health_rules import HealthRules
@@ -49,6 +50,7 @@ def rules_of(line: LineState) -> Sequence[Rule]:
         Pipelining(line.in_flight, effects),
         BusyDevices(),
         BroadcastReplies(devices),
+        BitWrites(),
         Stray(line.name, devices, line.health, effects),
         RequestExpiry(line.schedule.requests, effects),
         line.staleness,

@@ -37,7 +37,7 @@ from gateway.errors import (
 )
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
-from gateway.protocols.capabilities import Controllable, Monitor, ScatteredWriter
+from gateway.protocols.capabilities import ChangesBits, Controllable, Monitor, ScatteredWriter
 from gateway.protocols.driver import AnyDriver, Span, Talk
 
 T = TypeVar("T")
@@ -163,10 +163,13 @@ async def _write(write: Write, talk: Transaction) -> Sent:
     units = write.units
     if write.resyncs.before is not None:
         await driver.resync(talk, tag.span, write.resyncs.before, write.device.probe_spans)
-    if tag.part is not None:
+    if tag.part is not None and not write.masked:
         (word,) = await driver.read(talk, tag.span)
         units = [tag.part.into(word, write.units[0])]
-    if write.long is None:
+    if write.masked and tag.part is not None and isinstance(driver, ChangesBits):
+        bits = tag.part.into(0, write.units[0])
+        sending = driver.change_bits(talk, tag.span, tag.part.bits, bits)
+    elif write.long is None:
         sending = driver.write(talk, tag.span, units)
     else:
         sending = _one_by_one(write, write.long, talk)

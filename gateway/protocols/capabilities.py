@@ -42,6 +42,20 @@ class WritesAround(Protocol):
 
 
 @runtime_checkable
+class ChangesBits(Protocol[F]):
+    """A driver whose device may change some bits of a word by itself, and leave the others."""
+
+    def changes_bits(self, span: Span) -> bool:
+        """Returns True if it can be tried for the word of this span."""
+
+    async def change_bits(self, talk: Talk[F], span: Span, mask: int, bits: int) -> bool:
+        """Changes the bits of `mask` to those of `bits`, as `write` does.
+
+        Raises `Refused` with `unexecuted` where the device lacks the function.
+        """
+
+
+@runtime_checkable
 class Monitor(Protocol[F]):
     """A driver whose device stores a list of addresses and reads it cheaply (BM/MB, WM/MN).
 

@@ -24,12 +24,17 @@ class Part(NamedTuple):
     shift: int
     mask: int
 
+    @property
+    def bits(self) -> int:
+        """The bits of the word, each as 1."""
+        return self.mask << self.shift
+
     def of(self, word: int) -> int:
         return word >> self.shift & self.mask
 
     def into(self, word: int, part: int) -> int:
         """Returns the word with another part."""
-        return word & ~(self.mask << self.shift) | part << self.shift
+        return word & ~self.bits | part << self.shift
 
 
 def part_of(layout: Layout, bit: int | None) -> Part | None:

@@ -65,6 +65,7 @@ class WriteResult(NamedTuple):
     took: float  # seconds from submitting to the acknowledgement
     verified: bool = False  # read back and found equal
     acknowledged: bool = True  # False only for a broadcast: no device acknowledges it
+    note: str = ""  # what the client must know of the way in which it was written
 
 
 def has_value(sample: Sample) -> bool:

@@ -65,6 +65,14 @@ def broadcast_device() -> Device:
     return made_device("all", driver, WIRE, timing, tags)
 
 
+def bit_device() -> Device:
+    """Bit 3 and bit 4 of one register, and the register beside it."""
+    driver = ModbusRtu(station=1)
+    texts = ("holding:7.3", "holding:7.4", "holding:8")
+    tags = [make_tag(text, driver, write=WriteRule()) for text in texts]
+    return made_device("bits", driver, WIRE, replace(driver.timing, retries=1), tags)
+
+
 def tcp_device(blocks: int = 6) -> Device:
     """Takes several requests at once; has so many blocks of one register."""
     driver = ModbusTcp(station=1, window=4)

@@ -8,15 +8,17 @@ import pytest
 
 from gateway.engine.beliefs import BELIEFS, Belief, table
 from gateway.engine.device.health import PROBE_SPREAD, State
-from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
+from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
+from gateway.engine.results.bit_writes import BitWrites
 from gateway.engine.results.busy_devices import BusyDevices
 from gateway.engine.results.pipelining import Pipelining
 from gateway.engine.results.shorter_silences import ShorterSilences
 from gateway.errors import Evidence, Garbled, NoReply, Refusal, Refused
 from gateway.line.channel import Echo
 from gateway.planning.planner import Block
-from tests.engine.rig import SILENCE, Rig, link_device, tcp_device
+from tests.engine.rig import SILENCE, Rig, bit_device, link_device, tcp_device
 
 HOUR = 3600.0
 PAGE = Path(__file__).parents[2] / "docs" / "beliefs.md"
@@ -232,6 +234,26 @@ def bridge_waits() -> Way:
     return given_up
 
 
+def changes_no_bits() -> Way:
+    rig = Rig(bit_device())
+    rig.bring(State.ONLINE)
+    rule: BitWrites = rule_of(rig, BitWrites)
+    tag = rig.device.tags[0]
+
+    def is_masked(now: float) -> bool:
+        write = Write(rig.device, tag, [1], now)
+        rule.before(write, now)
+        return write.masked
+
+    write = Write(rig.device, tag, [1], 0.0, masked=True)
+    rule.concluded(write, Sent(), Traffic(), 0.0, 0)
+    for now in (HOUR - 1, HOUR):
+        assert is_masked(now)
+        rule.concluded(write, SILENCE, Traffic(), now, 0)
+    assert not is_masked(HOUR)
+    return lambda after: is_masked(HOUR + after)
+
+
 def busy() -> Way:
     rule, device = BusyDevices(), link_device()
     poll = Poll(device, device.blocks[0], device.blocks[0].span)
@@ -314,6 +336,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "refuses monitor lists": monitor_list,
     "refuses a longer read": longer_read,
     "a bridge waits for a dead unit": bridge_waits,
+    "does not change bits by itself": changes_no_bits,
     "a device is busy": busy,
     "a device is offline": offline,
     "noise destroys its replies": noise,

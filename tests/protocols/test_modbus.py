@@ -398,6 +398,33 @@ async def test_a_write_is_acknowledged_by_its_own_address_and_value_only() -> No
         await driver.write(hearing(driver, wrong), span, [0x1234])
 
 
+@pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii, ModbusTcp])
+async def test_bits_are_changed_by_function_22_as_the_standard_has_it(kind: type) -> None:
+    """Application protocol V1.1b3, 6.16: register 5, AND 00F2h, OR 0025h."""
+    driver, example = kind(station=1), bytes.fromhex("16 00 04 00 f2 00 25")
+    talk = hearing(driver, [framed(kind, 1, example)])
+    span, mask = Span("holding", 4, 1), 0xFF0D  # the bits that AND does not keep
+    assert driver.changes_bits(span)
+    assert await driver.change_bits(talk, span, mask, 0x25) is True
+    assert talk.sent == [framed(kind, 1, example)]
+    other = framed(kind, 1, bytes.fromhex("16 00 04 00 f2 00 24"), 2)
+    with pytest.raises(NoReply):
+        await driver.change_bits(hearing(driver, [other]), span, mask, 0x25)
+    refused = framed(kind, 1, bytes.fromhex("96 01"), 3)
+    with pytest.raises(Refused) as caught:
+        await driver.change_bits(hearing(driver, [refused]), span, mask, 0x25)
+    assert (caught.value.code, caught.value.unexecuted) == ("01", True)
+
+
+def test_devices_whose_manuals_lack_function_22_are_not_asked() -> None:
+    """Vigor B-5, LS 8.3 and EX485LNK 2.4 name their functions; no station answers a broadcast."""
+    assert not ModbusRtu(station=1, addressing="vigor").changes_bits(Span("D", 7, 1))
+    assert not ModbusRtu(station=1, addressing="k120s").changes_bits(Span("MW", 7, 1))
+    assert not ModbusRtu(station=1, addressing="ex485lnk").changes_bits(Span("holding", 7, 1))
+    assert not ModbusRtu(station=0).changes_bits(Span("holding", 7, 1))
+    assert not ModbusRtu(station=1).changes_bits(Span("input", 7, 1))
+
+
 async def test_vigor_may_forget_the_address_in_its_answer_to_function_06() -> None:
     forgetful = framed(ModbusRtu, 1, bytes((6, 0, 0, 0x12, 0x34)))
     other_value = framed(ModbusRtu, 1, bytes((6, 0, 0, 0x12, 0x35)))

@@ -23,6 +23,7 @@ from gateway.parts.transfers.forecast import TransferForecast, forecasts, transf
 from gateway.parts.web import exposure
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.protocols.capabilities import ChangesBits
 from gateway.tags.tag import CounterRule
 
 
@@ -88,13 +89,16 @@ def _without_polls(config: Config) -> Iterator[RenderableType]:
 
 
 def _notes(config: Config) -> Iterator[str]:
-    tags = [tag for one in config.devices if one.served is None for tag in one.tags]
-    for tag in tags:
+    asked = [(one, tag) for one in config.devices if one.served is None for tag in one.tags]
+    tags = [tag for _, tag in asked]
+    for device, tag in asked:
         if tag.write is not None and tag.part is not None:
-            part = "one bit" if tag.address.bit is not None else "one byte"
+            part, driver = "one bit" if tag.address.bit is not None else "one byte", device.driver
+            may_mask = isinstance(driver, ChangesBits) and driver.changes_bits(tag.span)
+            unless = ", unless the device has function 22" if may_mask else ""
             yield (
                 f"writing {tag.key} ({tag.text}) reads the word, changes {part} and writes "
-                "the word back; changes by the PLC in between are lost"
+                f"the word back; changes by the PLC in between are lost{unless}"
             )
     for tag in tags:
         if tag.origin.kept is None and (limit := tag.exact_below) is not None:

@@ -177,7 +177,7 @@ class ServedDevice:
 
 def _bits(tag: Tag) -> int:
     """Returns the bits of each word that a tag has."""
-    return 0xFFFF_FFFF if tag.part is None else tag.part.mask << tag.part.shift
+    return 0xFFFF_FFFF if tag.part is None else tag.part.bits
 
 
 def _role_problems(

@@ -221,7 +221,7 @@ _Cell = tuple[str, str, int]  # device, area, number
 def _cells(tag: Tag) -> Iterator[tuple[_Cell, int]]:
     """Yields the places that a value comes from, or goes to, with the bits of each."""
     for one in leaves(tag):
-        bits = 0xFFFF_FFFF if one.part is None else one.part.mask << one.part.shift
+        bits = 0xFFFF_FFFF if one.part is None else one.part.bits
         for number in range(one.span.start, one.span.start + one.span.size):
             yield (one.device, one.span.area, number), bits
 

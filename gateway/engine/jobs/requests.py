@@ -7,7 +7,7 @@ from itertools import takewhile
 from typing import NamedTuple
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.long_writes import LongWrite, long_write
+from gateway.engine.device.long_writes import LongWrite, long_write, writes_around
 from gateway.engine.jobs.runs import run_of
 from gateway.errors import GatewayError, NotSent
 from gateway.protocols.capabilities import Controllable, ScatteredWriter
@@ -17,6 +17,7 @@ from gateway.values import Value
 
 WRITE_EXPIRY = 5.0  # seconds after which a waiting request is no longer sent
 MOST_WAITING = 1000  # writes and commands
+RACE = "other bits of its word that the device changed at this moment may be as before"
 MOST_PEEKS = 16  # any client that may read can send them
 
 
@@ -75,6 +76,7 @@ class Write:
     alone: bool = False  # refused together with others before any was done: now sent alone
     resyncs: Resyncs = NO_RESYNCS
     group: Group | None = None
+    masked: bool = False  # the device changes the bits of its word by itself
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
     long: LongWrite | None = field(init=False, default=None)  # None: one request is enough
 
@@ -97,6 +99,17 @@ class Write:
     def send_alone(self) -> None:
         """Notes that none of the writes that it shared a request with was done."""
         self.alone = True
+
+    def mask(self, *, masked: bool) -> None:
+        """Has the device change the bits of the word by itself, or not."""
+        self.masked = masked
+
+    @property
+    def _races(self) -> bool:
+        """True if bits around it are written as they were read."""
+        if self.tag.part is not None:
+            return not self.masked
+        return writes_around(self.device.driver, self.tag.span)
 
     @property
     def plain(self) -> bool:
@@ -122,7 +135,8 @@ class Write:
         self, now: float, time: int, *, verified: bool = False, acknowledged: bool = True
     ) -> WriteResult:
         """Returns the result. `now` by the line's clock, `time` in ns since 1970."""
-        return WriteResult(self.value, time, now - self.submitted, verified, acknowledged)
+        took, note = now - self.submitted, RACE if self._races else ""
+        return WriteResult(self.value, time, took, verified, acknowledged, note)
 
 
 @dataclass(slots=True, eq=False)

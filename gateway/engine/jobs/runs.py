@@ -33,7 +33,7 @@ def run_of(writes: "Sequence[Write]") -> tuple[int, Span]:
         tag = write.tag
         if tag.span.area != area or not _may_share(write):
             break
-        mask = _WHOLE if tag.part is None else tag.part.mask << tag.part.shift
+        mask = _WHOLE if tag.part is None else tag.part.bits
         for address in range(tag.span.start, tag.span.start + tag.span.size):
             if written.get(address, 0) & mask:  # the second value would be lost, or the first
                 return count, run

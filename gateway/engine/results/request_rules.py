@@ -67,8 +67,8 @@ class RequestRules:
                 return self._written_together(job, result, now, time)
             case ReadBack():
                 self._read_back(job, result, now, time)
-            case Write() as write:
-                self._end(write, self._written(write, result, None, now, time), now)
+            case Write():
+                self._single(job, result, now, time)
             case Repeat(write=write, error=error):
                 self._end(write, self._written(write, result, error, now, time), now)
         return None
@@ -114,6 +114,15 @@ class RequestRules:
         """Ends the requests of a job that the line did not send."""
         for request in requests_of(job):  # a repetition says nothing about the first try
             self._end(request, job.error if isinstance(job, Repeat) else why, now)
+
+    def _single(self, write: Write, result: Result, now: float, time: int) -> None:
+        """Ends a write, or has it sent the other way where the device lacks the first one."""
+        refused = isinstance(result, Refused) and result.refusal is not Refusal.BUSY
+        outcome = self._written(write, result, None, now, time)
+        if write.masked and refused:
+            self._schedule.requests.each_alone((write,))
+        else:
+            self._end(write, outcome, now)
 
     def _written(
         self, write: Write, result: Result, first: DeviceError | None, now: float, time: int

@@ -213,7 +213,8 @@ SCHEMAS: Mapping[str, Schema] = {
             "verified": _about(FLAG, "Read back and found equal"),
             "acknowledged": _about(FLAG, "false only for a broadcast"),
             "took": NUMBER,
-        }
+        },
+        {"note": _about(TEXT, "What the client must know, such as a possible race")},
     ),
     "WrittenGroup": _record(
         {"tags": _by_name(ref("Written"), "By tag, in their order"), "took": NUMBER}

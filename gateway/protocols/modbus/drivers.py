@@ -94,6 +94,14 @@ class _Modbus:
     ) -> Coroutine[Any, Any, bool]:
         return self._master.write(talk, span, units)
 
+    def changes_bits(self, span: Span) -> bool:
+        return self._master.changes_bits(span)
+
+    def change_bits(
+        self, talk: Talk[Frame], span: Span, mask: int, bits: int
+    ) -> Coroutine[Any, Any, bool]:
+        return self._master.change_bits(talk, span, mask, bits)
+
     def resync(
         self,
         talk: Talk[Frame],

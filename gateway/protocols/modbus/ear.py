@@ -13,6 +13,7 @@ from gateway.protocols.modbus.ascii import body_of
 from gateway.protocols.modbus.frame import (
     DIAGNOSTICS,
     EXCEPTION,
+    MASK_WRITE,
     READ_BITS,
     READ_WORDS,
     WRITE_MANY,
@@ -23,8 +24,8 @@ from gateway.protocols.modbus.mbap import MbapCodec
 from gateway.protocols.modbus.rtu import is_sound
 
 _READS = (*READ_BITS, *READ_WORDS)
-_MASK_WRITE, _READ_AND_WRITE, _REPORT_ID = 22, 23, 17
-_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS, _MASK_WRITE)  # the good reply is equal to the request
+_READ_AND_WRITE, _REPORT_ID = 23, 17
+_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS, MASK_WRITE)  # the good reply is equal to the request
 _MOST = {1: 2000, 2: 2000, 3: 125, 4: 125}  # units of a read
 
 # Lengths of PDUs by function, and for the others the place of the byte that counts the rest.

@@ -16,6 +16,7 @@ READ_WORDS = (3, 4)
 WRITE_SINGLE = (5, 6)
 WRITE_MANY = (15, 16)
 DIAGNOSTICS = 8
+MASK_WRITE = 22
 EXCEPTION = 0x80  # added to the function code of the request
 
 
@@ -27,4 +28,4 @@ def answer_length(request: bytes) -> int:
         return 2 + (count + 7) // 8
     if function in READ_WORDS:
         return 2 + 2 * count
-    return 5
+    return 7 if function == MASK_WRITE else 5

@@ -149,13 +149,27 @@ class Master:
         return lambda reply: units(reply[:2] + reply[2 + 2 * begin : 2 + 2 * (begin + size)])
 
     async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
-        request = self._write_request(span, units)
+        return await self._send(talk, self._write_request(span, units))
+
+    def changes_bits(self, span: Span) -> bool:
+        """True for a register of a device whose manual does not say that it lacks function 22."""
+        place = self._place(span)
+        own = place is not None and place.function == 3 and place.area.writable
+        return own and self.dialect.masks and not self.broadcast
+
+    async def change_bits(self, talk: Talk[Frame], span: Span, mask: int, bits: int) -> bool:
+        wire = self.dialect.places[span.area].at(span.start)
+        return await self._send(talk, pdu.mask_request(wire, mask, bits))
+
+    async def _send(self, talk: Talk[Frame], request: bytes) -> bool:
+        """Sends a write. Returns False for a broadcast, which has no reply."""
         number = next(self._numbers) & 0xFFFF
         frame = Frame(self.station, request, number)
         if self.broadcast:
             await talk.tell(frame)
             return False
-        good = {request[:5]}  # 05 and 06 repeat the request, 15 and 16 its address and count
+        length = answer_length(request)  # 15 and 16 repeat address and count, others all
+        good = {request[:length]}
         if self.dialect.forgets_address and request[0] == 6:
             good.add(request[:1] + bytes(2) + request[3:])
 
@@ -173,7 +187,7 @@ class Master:
             pdu.raise_refusal(heard.pdu, request[0])
             return None
 
-        return await talk.ask(frame, self.chars(5), answers)
+        return await talk.ask(frame, self.chars(length), answers)
 
     def _write_request(self, span: Span, units: Sequence[int]) -> bytes:
         place = self._place(span)

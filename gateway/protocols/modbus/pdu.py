@@ -13,6 +13,7 @@ from pymodbus.pdu.bit_message import (
 from pymodbus.pdu.diag_message import ReturnQueryDataRequest
 from pymodbus.pdu.pdu import ModbusPDU
 from pymodbus.pdu.register_message import (
+    MaskWriteRegisterRequest,
     ReadHoldingRegistersRequest,
     ReadInputRegistersRequest,
     WriteMultipleRegistersRequest,
@@ -20,7 +21,7 @@ from pymodbus.pdu.register_message import (
 )
 
 from gateway.errors import NoReply, Refusal, Refused, Unclear
-from gateway.protocols.modbus.frame import EXCEPTION
+from gateway.protocols.modbus.frame import EXCEPTION, MASK_WRITE, WRITE_MANY, WRITE_SINGLE
 
 _READS: dict[int, type[ModbusPDU]] = {
     1: ReadCoilsRequest,
@@ -58,6 +59,12 @@ def write_words_request(wire: int, words: Sequence[int], *, single: bool) -> byt
     if single:
         return _encode(WriteSingleRegisterRequest(address=wire, registers=words))
     return _encode(WriteMultipleRegistersRequest(address=wire, registers=words))
+
+
+def mask_request(wire: int, mask: int, bits: int) -> bytes:
+    """Changes the bits of `mask` to those of `bits`."""
+    keep = ~mask & 0xFFFF
+    return _encode(MaskWriteRegisterRequest(address=wire, and_mask=keep, or_mask=bits))
 
 
 def loopback_request(token: int) -> bytes:
@@ -106,7 +113,7 @@ def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
 
 
 _ACCEPTED = 5
-_WRITES = (5, 6, 15, 16)
+_WRITES = (*WRITE_SINGLE, *WRITE_MANY, MASK_WRITE)
 _NOT_DONE = (1, 2, 3, 6, 10)  # exceptions without any effect
 # Of these, the exceptions that name no address and no value: of several none was looked at.
 _UNEXECUTED = (1, 6, 10)

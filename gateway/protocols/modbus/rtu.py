@@ -9,6 +9,7 @@ from gateway.protocols.checksums import crc16
 from gateway.protocols.modbus.frame import (
     DIAGNOSTICS,
     EXCEPTION,
+    MASK_WRITE,
     READ_BITS,
     READ_WORDS,
     WRITE_MANY,
@@ -21,8 +22,8 @@ _WRAPPING = 3  # characters around the PDU: station and CRC
 _SHORTEST = 5  # an exception
 _KEPT = 520  # no frame is longer than 260; bytes before the last two frames are noise
 _FIXED = (*WRITE_SINGLE, *WRITE_MANY, DIAGNOSTICS)
-_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS)  # the good reply is equal to the request
-_KNOWN = (*READ_BITS, *READ_WORDS, *_FIXED)
+_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS, MASK_WRITE)  # the good reply is equal to the request
+_KNOWN = (*READ_BITS, *READ_WORDS, *_FIXED, MASK_WRITE)
 
 
 def chars(pdu_length: int) -> int:
@@ -110,6 +111,8 @@ def _reply_size(heard: bytes | bytearray, start: int) -> int:
     function, third = heard[start + 1], heard[start + 2]
     if function in _FIXED:
         return 8
+    if function == MASK_WRITE:
+        return 10
     if function in READ_WORDS:
         return 5 + third if third and third % 2 == 0 else 0
     if function in READ_BITS:
@@ -173,4 +176,6 @@ def _request_size(heard: bytearray, start: int) -> int:
     function = heard[start + 1]
     if function in WRITE_MANY:
         return 9 + heard[start + 6]
+    if function == MASK_WRITE:
+        return 10
     return 8 if function in _KNOWN else 0
