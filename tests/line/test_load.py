@@ -124,3 +124,35 @@ async def test_the_turnaround_is_learned_in_spite_of_a_refused_address() -> None
         known = dev.record.overdue
         await asyncio.sleep(60)
         assert dev.record.overdue == known
+
+
+@on_virtual_time
+async def test_blocks_go_in_an_order_in_which_neighbours_differ_and_none_is_longer() -> None:
+    """Two blocks of one shape, each read with more addresses, cost up to 8 % of the wire."""
+    dev = device(
+        [tag for n in range(12) for tag in words(40 * n, 1 + n // 4, every=0.05)],
+        learn_silence=False,
+    )
+    assert [block.span.size for block in dev.blocks] == 4 * [1] + 4 * [2] + 4 * [3]
+    line = plant([dev])
+    async with running(line):
+        await asyncio.sleep(5)
+        sent = len(line.bench.sent)
+        await asyncio.sleep(30)
+    bytes_read = [int(data[9:11], 16) for _, data in line.bench.sent[sent:]]
+    assert len(bytes_read) > 700
+    assert all(count not in bytes_read[n + 1 : n + 3] for n, count in enumerate(bytes_read))
+    assert set(bytes_read) == {2, 4, 6}
+    gaps = [b - a for a, b in itertools.pairwise(line.reads(dev, 5.0))]
+    assert max(gaps) < 1.5 * sum(dev.seconds(block.cost) for block in dev.blocks)
+
+
+@on_virtual_time
+async def test_a_block_of_the_commonest_shape_is_not_overtaken_for_ever() -> None:
+    """Nine blocks have one shape: the tenth, which differs from all, is no more often read."""
+    dev = device([tag for n in range(10) for tag in words(40 * n, 1 + 4 * (n == 9), every=0.01)])
+    line = plant([dev])
+    async with running(line):
+        await asyncio.sleep(30)
+    counts = [len(line.reads_of(block.tags[0], 5.0)) for block in dev.blocks]
+    assert max(counts) < 1.1 * min(counts)

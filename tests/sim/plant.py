@@ -125,7 +125,9 @@ class Plant:
 
     def reads(self, device: Device, since: float = 0.0) -> list[float]:
         """The times of good reads of the device's first tag."""
-        tag = device.tags[0]
+        return self.reads_of(device.tags[0], since)
+
+    def reads_of(self, tag: Tag, since: float = 0.0) -> list[float]:
         return [
             at
             for at, sample in self.reported

@@ -6,6 +6,7 @@ succession to one device do not expect replies of one shape: where they would, o
 addresses more. An extra reply then arrives as a stray frame.
 """
 
+from collections import deque
 from collections.abc import Hashable, Sequence
 
 from gateway.engine.device.long_writes import LongWrite
@@ -31,6 +32,7 @@ class ReplyShapes:
         "_acked",
         "_driver",
         "_mark",
+        "_recent",
         "_refused",
         "_told_all_until",
         "_used",
@@ -48,6 +50,7 @@ class ReplyShapes:
         self.longer = longer
         self.last: Hashable = None  # shape of the reply to the last request
         self._used: dict[Hashable, float] = {}  # when a read with each shape was sent last
+        self._recent: deque[Hashable] = deque(maxlen=MOST_CHOICES - 1)  # of the last requests
         self.span: Span | None = None  # of the last read
         self.at = -NEVER  # when the last transaction ended
         self.quiet = QUIET
@@ -71,7 +74,8 @@ class ReplyShapes:
         shape, read = choices[0][1], span  # the caller tells the block's own span by identity
         if now - self.at >= self.quiet:
             self._prove(now)
-        elif now - (longest_ago := used.get(shape, -NEVER)) < self.quiet:
+        elif self._is_recent(shape, now):
+            longest_ago = used.get(shape, -NEVER)
             some = choices if self.quiet == WARY else choices[:MOST_CHOICES]
             if span in self.longer.alone:
                 self.longer.alone.discard(span)
@@ -81,8 +85,22 @@ class ReplyShapes:
                     if at < longest_ago:
                         longest_ago, (read, shape) = at, choice
         used[shape] = now
+        self._recent.append(shape)
         self.last, self.span = shape, read
         return read
+
+    def collides(self, block: Block, now: float) -> bool:
+        """Returns True if a longer span would be read for the block now."""
+        if block.listed or now - self.at >= self.quiet:
+            return False
+        return self._is_recent(self.longer.choices(block.span)[0][1], now)
+
+    def _is_recent(self, shape: Hashable, now: float) -> bool:
+        """Returns True if one of the last two requests has the shape, or one of the last 1.5 s
+        while the device answers twice."""
+        if now - self._used.get(shape, -NEVER) >= self.quiet:
+            return False
+        return self.quiet == WARY or shape in self._recent
 
     def sent(self, shape: Hashable, now: float) -> None:
         """Notes a read that is no poll, or a command, and the shape of its reply."""
@@ -90,6 +108,7 @@ class ReplyShapes:
         self._sent(shape, now)
 
     def _sent(self, shape: Hashable, now: float) -> None:
+        self._recent.append(shape)
         if now - self.at >= self.quiet:
             self._prove(now)
         self.last = shape

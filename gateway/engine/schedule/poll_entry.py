@@ -25,7 +25,8 @@ class PollEntry:
     reads: BlockReads = field(default_factory=BlockReads)
     tries: int = 0
     soon: float = math.inf  # an earlier deadline, because its values are bad
-    asked: float = 0.0  # when it was handed out last
+    asked: float = 0.0  # when it was handed out last; later by the time of a late poll it overtook
+    ahead: float = 0.0  # seconds by which it overtakes a late poll
     expedited: bool = False  # before its time, because a client waits
     phased: bool = True  # it has found its place in the period
     live: bool = True  # False after the device was planned again
@@ -74,12 +75,16 @@ class PollEntry:
         """Gives it an earlier deadline; `inf`: that of its interval."""
         self.soon = deadline
 
+    def overtake(self, ahead: float) -> None:
+        """Goes before a late poll. It is due so much later then: it is read no more often."""
+        self.ahead = ahead
+
     def hand_out(self, now: float, *, expedited: bool = False) -> "PollEntry":
         """Begins a poll: `job` is what the line has to read."""
         self.ticket = NOT_QUEUED  # its entry in the heap is stale now
         if self.due > now:
             self.due = now
-        self.asked, self.expedited = now, expedited
+        self.asked, self.ahead, self.expedited = now + self.ahead, 0.0, expedited
         block, device, job = self.block, self.device, self.job
         shapes = device.shapes
         span = block.span if shapes is None else shapes.polled(block, now)

@@ -10,6 +10,7 @@ from gateway.engine.device.device import Device
 from gateway.engine.schedule.poll_entry import EXPEDITED, NOT_QUEUED, ON_DEMAND, PollEntry
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
+OVERTAKEN, LOOKED_AT = 0.5, 32  # seconds, and the first entries of a heap: about the next polls
 NO_PLACE, LATE = -1, -2  # places of a device: nothing is due; its first poll is late
 Heap = list[tuple[float, int, PollEntry]]
 
@@ -98,6 +99,23 @@ class PollQueue:
                 self.expedited.remove(poll)
             poll.queue(EXPEDITED)
             self.expedited.appendleft(poll)
+
+    def first_to_differ(self, first: PollEntry, now: float) -> PollEntry:
+        """Returns the first due poll, or in its place one of the next whose reply has another shape
+        than those just before. It must not be much later, nor make the first one late."""
+        shapes, heap = first.device.shapes, self.by_device[first.device].heap
+        if shapes is None or len(heap) == 1 or not shapes.collides(first.block, now):
+            return first
+        deadline = heap[0][0]
+        if now < deadline < now + OVERTAKEN:
+            return first
+        for later in sorted(heap[1:LOOKED_AT]):
+            if later[0] > deadline + OVERTAKEN:
+                break
+            if _is_valid(later) and not shapes.collides(later[2].block, now):
+                later[2].overtake(later[0] - deadline if deadline < now else 0.0)
+                return later[2]
+        return first
 
     def return_due(self, now: float) -> None:
         """Makes expedited polls that are due by now due polls like others."""

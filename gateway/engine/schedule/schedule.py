@@ -262,6 +262,8 @@ class Schedule:
         first = queue.expedited and not self._expedited and self._may_expedite(now, now)
         if expedited := poll is None or bool(first):
             poll = queue.expedited[0]
+        else:
+            poll = queue.first_to_differ(poll, now)
         shapes = poll.device.shapes
         if shapes is not None and shapes.mark_due <= now < shapes.at + shapes.quiet:
             poll.device.health.left_outstanding(shapes.span, now)
