@@ -1,13 +1,12 @@
-"""An open port with its clock, its echo and its wire log: sends all bytes of a line."""
+"""An open port with its clock, its echo, its silences and its wire log."""
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import structlog
 
 from gateway.engine.jobs.unanswered import Unanswered
-from gateway.errors import Busy, Garbled, LineDown
+from gateway.errors import Garbled, LineDown
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
 from gateway.transport import Port
@@ -28,40 +27,30 @@ class Alarm:
     running, and `look` finds the requests whose time-out ended.
     """
 
-    __slots__ = ("_due", "_look", "_timer")
+    __slots__ = ("_timer", "due", "look")
 
-    def __init__(self) -> None:
-        self._due = NEVER  # the time of the timer
-        self._look: Callable[[], float] = lambda: NEVER
+    def __init__(self, look: Callable[[], float] = lambda: NEVER) -> None:
+        """`look` is called at `due` or earlier, and returns the next time."""
+        self.look = look
+        self.due = NEVER  # the time of the timer
         self._timer: asyncio.TimerHandle | None = None
 
-    def by(self, when: float, look: Callable[[], float]) -> None:
-        """Calls `look` at `when` or earlier, instead of an older one. It returns its next time."""
-        self._look = look
-        if when < self._due:
+    def by(self, when: float) -> None:
+        """Calls `look` at `when` or earlier."""
+        if when < self.due:
             if self._timer is not None:
                 self._timer.cancel()
-            self._due = when
+            self.due = when
             self._timer = asyncio.get_running_loop().call_at(when, self._off)
 
     def cancel(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._due, self._timer = NEVER, None
+        self.due, self._timer = NEVER, None
 
     def _off(self) -> None:
-        self._due, self._timer = NEVER, None
-        again = self._look()
-        if again < NEVER:
-            self.by(again, self._look)
-
-
-@dataclass(slots=True)
-class Expiry:
-    """Calls the line at the deadline of its engine."""
-
-    alarm: Alarm = field(default_factory=Alarm)
-    at: float = NEVER  # the deadline when the alarm was set last
+        self.due, self._timer = NEVER, None
+        self.by(self.look())
 
 
 class Echo:
@@ -156,14 +145,13 @@ class Channel:
     """An open port, and the last time when its wire was busy."""
 
     __slots__ = (
-        "_may_not_send",
-        "_port",
         "alarm",
         "echo",
-        "guarded",
         "loop",
         "lost_by",
+        "may_not_send",
         "now",
+        "port",
         "quiet_since",
         "unanswered",
         "wire",
@@ -190,27 +178,9 @@ class Channel:
         self.quiet_since = self.now()
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
-        self.guarded: float | None = None  # the next frame is a write of this time
-        self._may_not_send = may_not_send
+        self.may_not_send = may_not_send
         self.unanswered = Unanswered()  # the numbered requests of this connection that timed out
-        self._port = port
-
-    def check_duty(self) -> None:
-        """Raises `Busy` if the next frame is a write that must not be sent now."""
-        since, self.guarded = self.guarded, None
-        if since is not None and (why := self._may_not_send(since, self.now())):
-            raise Busy(why)
-
-    def send(self, data: bytes, now: float) -> None:
-        """Sends the bytes. Raises `LineDown`."""
-        if self.lost_by is not None:
-            raise self.lost_by
-        if self.echo.strip:
-            self.echo.sent(data)
-        if self.wire_log.active:
-            self.wire_log.sent(data)
-        self.quiet_since = now
-        self._port.write(data)
+        self.port = port
 
     def pause(self, seconds: float) -> None:
         """Keeps the line silent for so long, while stations process a broadcast."""
@@ -231,7 +201,7 @@ class Channel:
 
     async def close(self) -> None:
         self.alarm.cancel()
-        await self._port.close()
+        await self.port.close()
 
 
 def channels(

@@ -67,7 +67,7 @@ def samples_of(performed: Performed) -> Sequence[Sample]:
     job, result = performed.job, performed.result
     if not isinstance(job, Poll) or isinstance(result, Exception):
         return ()
-    return _samples(job.block, cast("Sequence[Any]", result))
+    return _samples(job.block, job.own(cast("Sequence[Any]", result)))
 
 
 def _text(value: Value | None) -> str:

@@ -24,10 +24,10 @@ from gateway.engine.jobs.requests import WRITE_EXPIRY, Command, Group, Outcome, 
 from gateway.errors import CallEnded, GatewayError, LineDown
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
-from gateway.line.channel import NEVER, Channel, Expiry, channels
+from gateway.line.channel import NEVER, Alarm, Channel, channels
 from gateway.line.perform import perform
+from gateway.line.polling import RESULTS, perform_together
 from gateway.line.send_permit import Duty
-from gateway.line.together import perform_together
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.protocols.driver import Span
@@ -73,7 +73,7 @@ class Line:
         self._lost: LineDown | None = None
         self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
-        self._expiry = Expiry()
+        self._alarm = Alarm(self._expire)  # at the deadline of the engine
         self._waiting: WaitingChange | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
@@ -262,7 +262,7 @@ class Line:
         channel, self._channel = self._channel, None
         self._transaction = self.calls = None
         self.engine.reach_by_modem(False)
-        self._expiry.alarm.cancel()  # its timer would keep an ended line alive
+        self._alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()
 
@@ -274,29 +274,40 @@ class Line:
             if self._lost is not None or self._waiting is not None or engine.deadline <= begun:
                 self.catch_up(begun)
             job = engine.next(begun)
-            if isinstance(job, Idle):
-                self._transaction = None
-                over = NEVER if self.calls is None else self.calls.over(begun)
-                if over <= begun:
+            if isinstance(job, Idle | Reopen):
+                if await self._rest(job, begun):
                     return
-                await self.idle(min(job.until, over))
                 continue
-            if isinstance(job, Reopen):
-                raise LineDown(job.why)
-            transaction = self._transaction
+            device, transaction = job.device, self._transaction
             if transaction is not None and isinstance(job, Settle):
                 transaction.traffic = Traffic()
             else:
-                transaction = self._transaction = Transaction(channel, job.device, self._unmatched)
-                if isinstance(job, Poll) and job.device.window > 1:
-                    polls = (job, *engine.alongside(job, begun))
-                    await perform_together(polls, transaction, channel, self._conclude)
-                    continue
-            result = await perform(job, transaction)
+                transaction = self._transaction = Transaction(channel, device, self._unmatched)
+            if isinstance(job, Poll) and device.window > 1:
+                polls = (job, *engine.alongside(job, begun))
+                await perform_together(polls, transaction, channel, self._conclude)
+                continue
+            if not isinstance(job, Poll) or job.block.listed or device.settings.verify_reads > 1:
+                result = await perform(job, transaction)
+            else:  # most jobs
+                try:
+                    result = await device.settings.driver.read(transaction, job.span)
+                except RESULTS as error:
+                    result = error
             if self.wire_log.active:
                 self.wire_log.performed(job, result, begun, now())
             traffic = transaction.traffic
             self.deliver(engine.conclude(job, result, traffic, now(), self._wall()))
+
+    async def _rest(self, job: Idle | Reopen, now: float) -> bool:
+        """Waits for the next job. Returns True if the telephone call is complete."""
+        if isinstance(job, Reopen):
+            raise LineDown(job.why)
+        self._transaction = None
+        over = NEVER if self.calls is None else self.calls.over(now)
+        if over > now:
+            await self.idle(min(job.until, over))
+        return over <= now
 
     def _conclude(self, poll: Poll, result: Result, traffic: Traffic) -> None:
         self.deliver(self.engine.conclude(poll, result, traffic, _now(), self._wall()))
@@ -326,9 +337,8 @@ class Line:
                         self._channel.pause(seconds)
                 case LogEvent(level, event, fields):
                     getattr(log, level)(event, **fields)
-        if self.engine.deadline != self._expiry.at:
-            self._expiry.at = self.engine.deadline
-            self._expiry.alarm.by(self._expiry.at, self._expire)
+        if self.engine.deadline < self._alarm.due:
+            self._alarm.by(self.engine.deadline)
 
     def _end(self, request: Request, outcome: Outcome) -> None:
         waiting = self._outcomes.pop(request)

@@ -5,7 +5,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.long_writes import LongWrite
 from gateway.engine.jobs.jobs import (
@@ -26,23 +25,17 @@ from gateway.engine.jobs.jobs import (
 from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.jobs.runs import needs_read, own_units, together, verified
 from gateway.errors import (
-    BadValue,
     Busy,
-    DeviceError,
-    Evidence,
-    LineDown,
     Refused,
     Unclear,
-    Unsteady,
 )
+from gateway.line.polling import RESULTS, read_poll
 from gateway.line.transaction import Transaction
-from gateway.planning.planner import Block
-from gateway.protocols.capabilities import ChangesBits, Controllable, Monitor, ScatteredWriter
+from gateway.protocols.capabilities import ChangesBits, Controllable, ScatteredWriter
 from gateway.protocols.driver import AnyDriver, Span, Talk
 
 T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
-DIFFER = "two readings in a row differ; verify_reads is for values that change slowly"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,17 +62,9 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
     """Returns the result of the job. Every error of a device or of the port is a result."""
     try:
         if isinstance(job, Poll):
-            device, block = job.device, job.block
-            if block.listed or device.settings.verify_reads > 1:
-                return await read_with_care(
-                    transaction, device, block, span=job.span, register=job.register
-                )
-            units = await device.settings.driver.read(transaction, job.span)
-            if job.span is not block.span:
-                units = _wanted(units, job.span, block.span)
-            return units
+            return await read_poll(job, transaction)
         return await _perform(job, transaction)
-    except (DeviceError, BadValue, LineDown, Busy) as error:
+    except RESULTS as error:
         return error
 
 
@@ -117,44 +102,12 @@ async def _command(job: Command, driver: Any, transaction: Transaction) -> str:
         await driver.resync(transaction, None, job.resyncs.before, job.device.probe_spans)
     if job.span is not None:
         return " ".join(map(str, await driver.read(transaction, job.span)))
-    transaction.guard(job.submitted)
+    transaction.guarded = job.submitted
     try:
         answer: str = await driver.control(transaction, job.name, job.argument)
         return answer
     finally:
-        transaction.guard(None)
-
-
-def _wanted(units: Sequence[int], longer: Span, wanted: Span) -> Sequence[int]:
-    """Returns the units of the wanted span, of those of the longer span around it."""
-    begin = wanted.start - longer.start
-    return units[begin : begin + wanted.size]
-
-
-async def read_with_care(
-    talk: Talk[Any], device: Device, block: Block, *, span: Span, register: bool = False
-) -> Sequence[int]:
-    """Returns the units of the block after `verify_reads` equal reads.
-
-    `span`: that of the block, or a longer one around it. `register`: registers the monitor list
-    in the PLC first. Raises `Unsteady` if two reads differ: a check sum does not find every error.
-    """
-    driver = device.driver
-    if register and isinstance(driver, Monitor):
-        await driver.register(talk, block.listed)
-    units = await _read_once(talk, device, block, span)
-    for _ in range(1, device.settings.verify_reads):
-        if list(await _read_once(talk, device, block, span)) != list(units):
-            raise Unsteady(DIFFER, evidence=Evidence.CHECKSUM)
-    return units
-
-
-async def _read_once(talk: Talk[Any], device: Device, block: Block, span: Span) -> Sequence[int]:
-    driver = device.driver
-    if not block.listed or not isinstance(driver, Monitor):
-        return _wanted(await driver.read(talk, span), span, block.span)
-    parts = await driver.read_registered(talk, block.listed)
-    return [unit for part in parts for unit in part]
+        transaction.guarded = None
 
 
 async def _write(write: Write, talk: Transaction) -> Sent:
@@ -235,13 +188,13 @@ async def _only_reply(
     `write`: the first of several; `run`: their addresses.
     """
     refused: Refused | None = None
-    talk.guard(write.submitted)
+    talk.guarded = write.submitted
     try:
         acknowledged = await sending
     except Refused as error:
         refused, acknowledged = error, False
     finally:
-        talk.guard(None)
+        talk.guarded = None
     token = write.resyncs.after
     if token is None and talk.traffic.doubtful:
         token = write.resyncs.spare

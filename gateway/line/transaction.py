@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Settled, Traffic
-from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
-from gateway.line.channel import KEPT, NEVER, Channel
+from gateway.errors import Busy, DeviceError, Evidence, Garbled, LineDown
+from gateway.line.channel import NEVER, Channel
+from gateway.line.timed_out import LateReply, verdict
 from gateway.protocols.driver import Codec, EndedByGap
 
 T = TypeVar("T")
@@ -29,19 +30,6 @@ class _Request:
     sent: float  # by the line's clock
     heard: int = 0  # characters of its reply
     equal: bool = False  # its reply was equal to it
-
-
-@dataclass(slots=True, eq=False)
-class _LateReply:
-    """A late reply: its request timed out, and it may still arrive."""
-
-    answers: Callable[[Any], Any]
-    arrived: bool = False
-    awaited: "asyncio.Future[None] | None" = None
-
-    def wake(self) -> None:
-        if self.awaited is not None and not self.awaited.done():
-            self.awaited.set_result(None)
 
 
 class Transaction:
@@ -64,6 +52,7 @@ class Transaction:
         "_on_unmatched_frame",
         "_open",
         "_stray",
+        "guarded",
         "has_sent",
         "traffic",
     )
@@ -76,6 +65,9 @@ class Transaction:
     ) -> None:
         """`on_unmatched_frame` gets each frame that is no reply, at once; True for an echo."""
         self.has_sent = False  # earlier bytes do not belong to it
+        # The next frame is the write of a client, submitted then: it is sent only if the duty is
+        # proven in that moment.
+        self.guarded: float | None = None
         self.traffic = Traffic()
         self._channel = channel
         self._device = device
@@ -88,7 +80,7 @@ class Transaction:
         self._heard = b""  # since the last request or reply
         self._answered = 0.0  # when the last reply arrived
         self._stray: Evidence | None = None  # of frames that were no reply
-        self._late: _LateReply | None = None
+        self._late: LateReply | None = None
         self._gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
 
     @property
@@ -102,21 +94,11 @@ class Transaction:
         """As `may_echo`, if an echo may begin that replies did not show before."""
         return self.may_echo or self._channel.echo.absent_by_evidence
 
-    def guard(self, since: float | None) -> None:
-        """Marks the next frame as the write of a client, submitted at `since`; None: it is not.
-
-        It is sent only if the duty is proven in that moment. Otherwise `Busy` is raised.
-        """
-        self._channel.guarded = since
-
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
         await channel.quiet(self._device.silence.kept)
-        channel.check_duty()
-        self.has_sent = True
-        channel.send(data, channel.now())
-        self.traffic.sent += len(data)
+        self._send(data, channel.now())
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
 
@@ -139,8 +121,6 @@ class Transaction:
             silence = started - channel.quiet_since
             if silence < self.traffic.silence:
                 self.traffic.silence = silence
-        if channel.guarded is not None:
-            channel.check_duty()
         data, character = self._codec.encode(frame), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
         wait = device.settings.timing.reply_timeout if within is None else within
@@ -148,10 +128,11 @@ class Transaction:
         unanswered = channel.unanswered
         if unanswered.requests:
             until += max(0.0, unanswered.held_up_until(device) - started)
-        channel.alarm.by(until, self._expire)
-        self.has_sent = True
-        channel.send(data, started)
-        self.traffic.sent += len(data)
+        alarm = channel.alarm
+        alarm.look = self._expire
+        if until < alarm.due:
+            alarm.by(until)
+        self._send(data, started)
         future: asyncio.Future[T] = channel.loop.create_future()
         request = _Request(data, frame, answers, until, reply, future, started)
         self._open.append(request)
@@ -174,6 +155,24 @@ class Transaction:
         if own > 0.0:
             traffic.turnaround += own
         return answer
+
+    def _send(self, data: bytes, now: float) -> None:
+        """Sends the bytes. Raises `LineDown`, and `Busy` for a write that must not be sent now."""
+        channel = self._channel
+        if (since := self.guarded) is not None:
+            self.guarded = None
+            if why := channel.may_not_send(since, now):
+                raise Busy(why)
+        if channel.lost_by is not None:
+            raise channel.lost_by
+        self.has_sent = True
+        if channel.echo.strip:
+            channel.echo.sent(data)
+        if channel.wire_log.active:
+            channel.wire_log.sent(data)
+        channel.quiet_since = now
+        channel.port.write(data)
+        self.traffic.sent += len(data)
 
     def _begin_hearing(self) -> None:
         """Drops earlier bytes: they must not become part of the reply."""
@@ -235,7 +234,19 @@ class Transaction:
     def _take(self, frames: Callable[..., list[Any]], *data: bytes) -> None:
         try:
             for frame in frames(*data):
-                self._offer(frame)
+                for request in self._open:
+                    if request.future.done():
+                        continue
+                    try:
+                        answer = request.answers(frame)
+                    except DeviceError as error:
+                        _fail(request, error)
+                        break
+                    if answer is not None:
+                        self._answer(request, frame, answer)
+                        break
+                else:
+                    self._stray_frame(frame)
         except Garbled as error:
             self._broken = error
             for request in self._open:
@@ -255,47 +266,11 @@ class Transaction:
         After a time-out: until the late reply has arrived, or for `guard` seconds. After noise:
         until `gap` seconds have passed without a byte, at most `guard`.
         """
-        channel, late = self._channel, self._late
-        start = channel.now()
-        until = start + guard
-        if late is None:
-            late = _LateReply(lambda frame: None)
-            while channel.lost_by is None:
-                quiet = channel.quiet_since + gap
-                if min(quiet, until) <= channel.now():
-                    return Settled(late=None, quiet=quiet <= channel.now())
-                await self._wait(late, min(quiet, until))
-            return Settled(late=None)
-        if late.arrived:
-            return Settled(late=0.0)
-        if channel.lost_by is None:
-            await self._wait(late, until)
-        return Settled(channel.now() - start if late.arrived else None)
+        self._late = self._late or LateReply(self._channel)
+        return await self._late.settle(guard, gap)
 
-    async def _wait(self, late: _LateReply, end: float) -> None:
-        """Waits until the late reply has arrived, the port is lost, or `end`."""
-        loop = asyncio.get_running_loop()
-        self._late, late.awaited = late, loop.create_future()
-        timer = loop.call_at(end, late.wake)
-        try:
-            await late.awaited
-        finally:
-            timer.cancel()
-
-    def _offer(self, frame: Any) -> None:
-        for request in self._open:
-            if request.future.done():
-                continue
-            try:
-                answer = request.answers(frame)
-            except DeviceError as error:
-                _fail(request, error)
-                return
-            if answer is not None:
-                self._learn_of_echo(request, frame, answer)
-                request.heard, self._heard = len(self._heard), b""
-                request.future.set_result(answer)
-                return
+    def _stray_frame(self, frame: Any) -> None:
+        """Takes a frame that answers no open request."""
         if self._takes_late(frame):
             return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
@@ -311,7 +286,8 @@ class Transaction:
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
 
-    def _learn_of_echo(self, request: _Request, frame: Any, answer: Any) -> None:
+    def _answer(self, request: _Request, frame: Any, answer: Any) -> None:
+        """Ends a request that was answered, and learns of an echo."""
         echo = self._channel.echo
         if not echo.strip and (echo.found is not False or request.data in self._heard):
             echo.learn(request.data, self._heard, request.reply)
@@ -319,23 +295,17 @@ class Transaction:
             request.equal = echo.absent_by_evidence and frame == request.frame
         else:
             echo.absent_at = self._channel.quiet_since
+        request.heard, self._heard = len(self._heard), b""
+        request.future.set_result(answer)
 
     def _takes_late(self, frame: Any) -> bool:
         """Returns True for the answer to a request that timed out, here or in an older one."""
-        late, unanswered = self._late, self._channel.unanswered
-        if late is not None and not late.arrived and self._is_late_reply(late, frame):
-            late.arrived = True
-            late.wake()
+        unanswered = self._channel.unanswered
+        if self._late is not None and self._late.is_it(frame):
             if unanswered.requests:
                 unanswered.forget(frame)
             return True
         return bool(unanswered.requests) and unanswered.take(frame, self._channel.quiet_since)
-
-    def _is_late_reply(self, late: _LateReply, frame: Any) -> bool:
-        try:
-            return late.answers(frame) is not None
-        except DeviceError:
-            return not self._needs_resync  # an error reply names no request
 
     def _expire(self) -> float:
         """Ends the requests that timed out. Returns the next time-out."""
@@ -346,7 +316,9 @@ class Transaction:
             if request.until > now:
                 again = min(again, request.until)
             else:
-                self._late = _LateReply(request.answers)
+                self._late = LateReply(
+                    self._channel, request.answers, takes_refusals=not self._needs_resync
+                )
                 self._channel.unanswered.timed_out(
                     self._device, request.frame, request.answers, request.sent
                 )
@@ -354,20 +326,7 @@ class Transaction:
         return again
 
     def _verdict(self, request: bytes) -> DeviceError:
-        early = self._channel.echo.early
-        heard = self._heard or early
-        shown = f"heard {heard[:KEPT].hex(' ')}"
-        if not heard:
-            return NoReply("no reply")
-        if early:
-            return Garbled(f"our own request did not come back: {shown}", heard)
-        if heard == request:
-            return Garbled("heard only our own request", heard, evidence=Evidence.ECHO)
-        if self._stray is Evidence.STATION:
-            return Garbled(f"another station spoke: {shown}", heard, evidence=Evidence.STATION)
-        if self._stray is Evidence.SHAPE:
-            return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
-        return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
+        return verdict(request, self._heard, self._channel.echo.early, self._stray)
 
 
 @cache

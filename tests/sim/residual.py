@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gateway.errors import DeviceError, NoReply
-from gateway.line.perform import read_with_care
+from gateway.line.polling import read_with_care
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, AnyDriver, Span

@@ -26,6 +26,13 @@ class Poll:
     span: Span  # to be read: that of the block, or a longer one around it
     register: bool = False  # its monitor list must be registered first
 
+    def own(self, units: Sequence[int]) -> Sequence[int]:
+        """Returns the units of the block, of those that were read."""
+        if self.span is self.block.span:
+            return units
+        begin = self.block.span.start - self.span.start
+        return units[begin : begin + self.block.span.size]
+
 
 class PolledBlock(Protocol):
     """A block in the schedule, as the other rooms see it."""

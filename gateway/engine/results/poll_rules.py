@@ -50,9 +50,10 @@ class PollRules:
         health = device.health
         if health.needs_resync or health.state is not State.ONLINE:
             self._results.answered(device, now, time)
-        shapes = device.shapes
-        if poll.job.span is not block.span and shapes is not None and shapes.longer.failed:
-            shapes.longer.answered(block.span)
+        if poll.job.span is not block.span:
+            units = poll.job.own(units)
+            if device.shapes is not None and device.shapes.longer.failed:
+                device.shapes.longer.answered(block.span)
         if not block.listed:
             device.was_read(block.span)
         self._effects.collected.append(Samples(poll.reads.take(block, units, now, time)))

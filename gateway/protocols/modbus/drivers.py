@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from gateway.errors import ConfigError
 from gateway.protocols.capabilities import ScanHints
-from gateway.protocols.driver import Address, Area, Codec, Cost, Span, Talk, Timing, Traits
+from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits
 from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.modbus import ascii as ascii_
 from gateway.protocols.modbus import mbap, rtu
@@ -143,6 +143,7 @@ class ModbusRtu(_Modbus):
 
     protocol: Literal["modbus-rtu"] = "modbus-rtu"
 
+    codec: ClassVar = RtuCodec
     scan_hints: ClassVar = ScanHints(formats=("8N1", "8E1", "8O1", "8N2"))
     dissector: ClassVar = "mbrtu"
     _traits: ClassVar = Traits(baudrate=9600, format="8E1", binary=True, word_type=Kind.UINT16)
@@ -151,9 +152,6 @@ class ModbusRtu(_Modbus):
     def timing(self) -> Timing:
         silence = max(_FASTEST_SILENCE, self._master.dialect.rtu_silence)
         return Timing(silence=silence, silence_chars=3.5)
-
-    def codec(self) -> Codec[Frame]:
-        return RtuCodec()
 
     def ear(self, character: float) -> Ear:
         return RtuEar(character)
@@ -169,15 +167,13 @@ class ModbusAscii(_Modbus):
 
     protocol: Literal["modbus-ascii"] = "modbus-ascii"
 
+    codec: ClassVar = AsciiCodec
     scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1", "7O1", "7N2"))
     _traits: ClassVar = Traits(baudrate=9600, format="7E1", word_type=Kind.UINT16)
 
     @property
     def timing(self) -> Timing:
         return Timing()
-
-    def codec(self) -> Codec[Frame]:
-        return AsciiCodec()
 
     def ear(self, character: float) -> Ear:
         return ascii_ear()
@@ -195,6 +191,7 @@ class ModbusTcp(_Modbus):
     station: int = 1
     window: int = 1  # the most outstanding requests that the device accepts
 
+    codec: ClassVar = MbapCodec
     scan_hints: ClassVar = ScanHints(formats=())
     dissector: ClassVar = "mbtcp"
     _traits: ClassVar = Traits(baudrate=None, word_type=Kind.UINT16)
@@ -202,9 +199,6 @@ class ModbusTcp(_Modbus):
     @property
     def timing(self) -> Timing:
         return Timing(turnaround=0.001, silence=0.0)
-
-    def codec(self) -> Codec[Frame]:
-        return MbapCodec()
 
     def ear(self, character: float) -> Ear:
         return MbapEar()

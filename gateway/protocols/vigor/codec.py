@@ -56,9 +56,6 @@ def encode(frame: Frame) -> bytes:
     return start + summed + b"%02X" % (sum(summed) & 0xFF)
 
 
-_encoded = lru_cache(maxsize=1024)(encode)  # polls send the same requests again and again
-
-
 # ACK; station, command, status; data; then ETX and the sum, or a wrong character. An ACK without
 # six digits behind it is noise; an ACK inside a frame begins another frame.
 _REPLY = re.compile(
@@ -73,12 +70,12 @@ class VigorCodec:
     The result does not depend on the pieces in which the bytes arrive.
     """
 
+    # Polls send the same requests again and again.
+    encode = staticmethod(lru_cache(maxsize=1024)(encode))
+
     def __init__(self) -> None:
         self._buffer = b""
         self._damage: Garbled | None = None
-
-    def encode(self, frame: Frame) -> bytes:
-        return _encoded(frame)
 
     def feed(self, data: bytes) -> list[Frame]:
         """Returns the replies completed by `data`.

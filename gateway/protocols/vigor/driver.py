@@ -65,6 +65,7 @@ class Vigor:
     station: int = 0
     format: str = _TRAITS.format
 
+    codec: ClassVar = VigorCodec
     scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1"), stations=range(32))
 
     def __post_init__(self) -> None:
@@ -115,9 +116,6 @@ class Vigor:
             return write
         read = _read_cost(covered)
         return Cost(read.request + write.request, read.reply + write.reply)
-
-    def codec(self) -> VigorCodec:
-        return VigorCodec()
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
         """Returns the units of `span`. Raises `ConfigError` for a span without `cost`."""
