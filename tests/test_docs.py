@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from textwrap import dedent
@@ -42,6 +43,7 @@ from gateway.northbound.session.exposures import exposures
 from gateway.parts.history.historian import Historian
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
+from gateway.tags.tag import READ
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint
 
@@ -646,14 +648,16 @@ def test_every_error_word_and_every_reason_is_explained() -> None:
 
 
 def test_the_answer_to_a_write_has_the_fields_of_the_page() -> None:
-    answer = json.loads(payload.outcome(WriteResult(7, 0, 0.1)))
+    answer = json.loads(payload.outcome(WriteResult(7, 0, 0.1, origin="simulated")))
     assert set(names("zenoh.md", "A write", "in the answer")) == set(answer)
 
 
 def test_a_value_has_the_fields_of_the_page() -> None:
-    tag = load(EXAMPLE).devices[0].tags[0]
+    simulated = load(EXAMPLE).devices[0].tags[0]
+    tag = replace(simulated, origin=READ)
     [shown] = [block for block in _blocks("zenoh.md") if block.language == "json"]
     known = [good(tag, 12.5, 0), bad(tag, Reason.NO_REPLY, 0, "No byte came back")]
+    known.append(good(simulated, 12.5, 0))
     assert [list(json.loads(line)) for line in shown.text.splitlines()] == [
         list(json.loads(payload.value(sample))) for sample in known
     ]
@@ -717,7 +721,7 @@ LONGEST_PAGE = 250
 WIDEST_LINE = 100
 FORMED = [*PAGES, *OWN]
 # Table rows cannot be wrapped; output and payloads are shown as they are.
-UNWRAPPED = re.compile(r"^\||^\{\"|^\$ (sqlite3|python3) |^other machines can reach ")
+UNWRAPPED = re.compile(r"^\||^\{\"|^\$ (sqlite3|python3) |^other machines can reach |^plant/\S+ \{")
 
 
 @pytest.mark.parametrize("page", FORMED, ids=lambda page: page.name)

@@ -59,8 +59,9 @@ def line_of(key: str, known: Known) -> str:
             fields += f",text={quoted(str(value))}"
         elif "text" in known:
             fields += f",text={quoted(str(known['text']))}"
+    origin = f",origin={known['origin']}" if "origin" in known else ""
     nanoseconds = round(datetime.fromisoformat(known["time"]).timestamp() * 1_000_000) * 1000
-    return f"plc,device={device},name={tag} {fields} {nanoseconds}"
+    return f"plc,device={device},name={tag}{origin} {fields} {nanoseconds}"
 
 
 def quoted(text: str) -> str:

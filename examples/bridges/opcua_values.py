@@ -54,6 +54,8 @@ def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
     if known["quality"] != "good":
         code = STATUS.get(known.get("reason", ""), Code.Bad)
     elif (variant := variant_of(known["value"], kind)) is not None:
+        if known.get("origin") == "simulated":  # no plain reading of a device: not simply Good
+            code = Code.GoodEdited
         return ua.DataValue(variant, ua.StatusCode(code), time, now)
     else:
         code = Code.BadTypeMismatch

@@ -100,12 +100,13 @@ def _standby(documents: Documents) -> str:
 
 
 def _lines(documents: Documents) -> Table:
+    simulated = documents["status"].get("simulated", ())
     table = _table("line", "state", "open for", "load", "expected", "requests/s", "slowest write")
     for name, document in below("lines/", documents):
         measured, expected = document["measured"], document["expected"]
         table.add_row(
             Text(name),
-            _state("open" if document["open"] else "down"),
+            _state(("simulated" if name in simulated else "open") if document["open"] else "down"),
             Text(span(document["open_for"])),
             Text(_share(measured["load"])),
             Text(_share(expected["load"])),

@@ -26,6 +26,8 @@ def row_of(sample: Sample) -> Row:
         document["text"] = text
     if sample.reason is not None:
         document["reason"] = sample.reason.value
+    if (origin := sample.tag.origin.word) is not None:
+        document["origin"] = origin
     return Row(sample.tag.key, document)
 
 
@@ -52,7 +54,9 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) ->
     for row in rows:
         document = row.document
         good = is_good(row)
-        quality = "good" if good else f"bad: {document.get('reason')}"
+        origin = document.get("origin")
+        quality = f"good, {origin}" if origin else "good"
+        quality = quality if good else f"bad: {document.get('reason')}"
         tag = tags.get(row.tag)
         table.add_row(
             Text(row.tag),

@@ -178,4 +178,5 @@ def outcome(target: str, answer: dict[str, object], *, held: bool = False) -> st
     elif answer.get("acknowledged") is False:
         how = "broadcast, without acknowledgement"
     note = f"; {answer['note']}" if "note" in answer else ""
+    how += f" ({answer['origin']})" if answer.get("origin") else ""
     return printable(f"{target} = {value_text(answer['value'])}: {how}, {took}{note}")

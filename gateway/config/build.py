@@ -34,7 +34,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS
-from gateway.transport.port import ModemAddress, SerialPath
+from gateway.transport.port import ModemAddress, SerialPath, SimulatorAddress
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
@@ -130,7 +130,10 @@ class Builder:
                 )
             self._devices.setdefault(checked, name)
             serve = line is not None and line.serve
-            device = self._device(checked, raw_device, place, defaults, serve=serve)
+            simulated = line is not None and line.port == SimulatorAddress()
+            device = self._device(
+                checked, raw_device, place, defaults, serve=serve, simulated=simulated
+            )
             if device is not None:
                 devices.append(device)
             if self.report is not None:
@@ -160,7 +163,14 @@ class Builder:
         )
 
     def _device(
-        self, name: str, raw: object, path: Path, outer: TagDefaults, *, serve: bool
+        self,
+        name: str,
+        raw: object,
+        path: Path,
+        outer: TagDefaults,
+        *,
+        serve: bool,
+        simulated: bool,
     ) -> DeviceSettings | None:
         if not isinstance(raw, dict):
             section(DeviceSection, raw, path, self.mistakes, "a device")
@@ -172,12 +182,17 @@ class Builder:
         defaults = self._defaults(raw, path, outer)
         addressing = ServedView(driver) if serve and driver is not None else driver
         self._intervals[name] = defaults.every
-        tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, addressing)
+        place: Path = (*path, "tags")
+        tags = self._tags.build(
+            name, raw.get("tags"), place, defaults, addressing, simulated=simulated
+        )
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
         for sheet in filter(None, (own_sheet, self.imports.get(name))):
             place, taken = (*path, "tags_from"), {tag.name for tag in tags}
-            tags += self._sheets.build(name, sheet, place, defaults, addressing, taken)
+            tags += self._sheets.build(
+                name, sheet, place, defaults, addressing, taken, simulated=simulated
+            )
         if settings is None or driver is None:
             return None
         served = None

@@ -20,6 +20,7 @@ def meta_fields(tag: Tag) -> dict[str, object]:
         "address": tag.text,
         "every": tag.every,
         "computed": None if tag.origin.formula is None else tag.origin.formula.text,
+        "origin": tag.origin.word,
     }
     for feature in FEATURES:
         found |= feature.meta(tag)

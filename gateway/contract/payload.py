@@ -2,7 +2,8 @@
 
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
 value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
-in `detail`. A value with a name has it in `text`. Integers stay JSON integers whatever their size:
+in `detail`. A value with a name has it in `text`. One that is no plain reading of a device has its
+`origin`: `simulated` or `computed`. Integers stay JSON integers whatever their size:
 beyond 2**53 a reader in JavaScript must parse them itself.
 """
 
@@ -30,6 +31,7 @@ from gateway.errors import (
     Unknown,
 )
 from gateway.tags import Quality, Reason, Sample, WriteResult
+from gateway.tags.tag import READ
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 from gateway.values.numerals import Scalar
@@ -154,15 +156,17 @@ def audited(error: GatewayError) -> Failure:
 
 def value(sample: Sample) -> bytes:
     """The value with quality and time. A good one in half the time that `sample_fields` takes."""
-    known = sample.value
-    if sample.quality is not _GOOD or not _has_json(known) or sample.tag.shaping.names is not None:
+    known, tag = sample.value, sample.tag
+    if sample.quality is not _GOOD or not _has_json(known) or tag.shaping.names is not None:
         return orjson.dumps(sample_fields(sample))
-    return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time))
+    origin = None if tag.origin is READ else tag.origin.word
+    return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time, origin))
 
 
 @lru_cache(maxsize=256)  # the samples of one scan share one time
-def _end_of_good(time: int) -> bytes:
-    return f',"quality":"good","time":"{rfc3339(time)}"}}'.encode()
+def _end_of_good(time: int, origin: str | None) -> bytes:
+    known = "" if origin is None else f',"origin":"{origin}"'
+    return f',"quality":"good","time":"{rfc3339(time)}"{known}}}'.encode()
 
 
 def _has_json(known: Value | None) -> bool:
@@ -230,8 +234,10 @@ def write_outcome(ended: WriteOutcome) -> bytes:
     }
     line["outcome"] = word(ended.result)
     match ended.result:
-        case WriteResult(verified=verified):
+        case WriteResult(verified=verified, origin=origin):
             line["verified"] = verified
+            if origin is not None:
+                line["origin"] = origin
         case CommandResult(answer):
             line["answer"] = short(answer)
         case Failure(_, reason, code):
@@ -256,32 +262,27 @@ def document(fields: Mapping[str, object]) -> bytes:
 
 
 def sample_fields(sample: Sample) -> dict[str, Value | None]:
-    known = sample.value
-    time = rfc3339(sample.time)
-    reason = sample.reason
-    if sample.quality is Quality.GOOD:
-        if _has_json(known):
-            if (
-                sample.tag.shaping.names is not None
-                and (text := sample.tag.shaping.names.text(known)) is not None
-            ):
-                return {"value": known, "text": text, "quality": "good", "time": time}
-            return {"value": known, "quality": "good", "time": time}
-        reason = Reason.NOT_A_NUMBER
-    fields: dict[str, Value | None] = {
-        "value": None,
-        "quality": "bad",
-        "reason": None if reason is None else reason.value,
-        "time": time,
-    }
-    if sample.detail:
-        fields["detail"] = short(sample.detail)
+    fields: dict[str, Value | None] = {"value": sample.value}
+    if sample.quality is Quality.GOOD and _has_json(sample.value):
+        names = sample.tag.shaping.names
+        if names is not None and (text := names.text(sample.value)) is not None:
+            fields["text"] = text
+        fields |= {"quality": "good", "time": rfc3339(sample.time)}
+    else:
+        reason = Reason.NOT_A_NUMBER if sample.quality is Quality.GOOD else sample.reason
+        known = None if reason is None else reason.value
+        time = rfc3339(sample.time)
+        fields = {"value": None, "quality": "bad", "reason": known, "time": time}
+        if sample.detail:
+            fields["detail"] = short(sample.detail)
+    if (origin := sample.tag.origin.word) is not None:
+        fields["origin"] = origin
     return fields
 
 
 def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
     match result:
-        case WriteResult(known, time, took, verified, acknowledged, note):
+        case WriteResult(known, time, took, verified, acknowledged, note, origin):
             fields: dict[str, Value | None] = {
                 "value": known,
                 "time": rfc3339(time),
@@ -289,7 +290,8 @@ def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
                 "acknowledged": acknowledged,
                 "took": round(took, 6),
             }
-            return fields | {"note": note} if note else fields
+            more = {"note": note or None, "origin": origin}
+            return fields | {name: one for name, one in more.items() if one is not None}
         case Failure(problem, reason, code):
             return {"error": problem.value, "code": code, "reason": short(reason)}
 

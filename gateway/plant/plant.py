@@ -319,6 +319,7 @@ class Plant:
                 "time": rfc3339(self._wall()),
                 "up": round(time.monotonic() - self._started, 1),
                 "tags": len(self._tags),
+                "simulated": [line.name for line in self.config.lines if line.simulated],
             }
         }
         forecasts = self._expected.lines()

@@ -15,7 +15,7 @@ Recorded = Iterator[tuple[Sample | Damaged | bool, Place | None]]
 
 
 class RecordedQuery(NamedTuple):
-    """The samples of tags (by `device/name`), from after the place `after`.
+    """The samples of tags (by their `recorded_key`), from after the place `after`.
 
     `now`: ns since 1970, when the query came.
     """

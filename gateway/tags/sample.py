@@ -66,6 +66,7 @@ class WriteResult(NamedTuple):
     verified: bool = False  # read back and found equal
     acknowledged: bool = True  # False only for a broadcast: no device acknowledges it
     note: str = ""  # what the client must know of the way in which it was written
+    origin: str | None = None  # simulated: no real device holds the value
 
 
 def has_value(sample: Sample) -> bool:

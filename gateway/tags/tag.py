@@ -65,9 +65,18 @@ class Origin:
     # Of the formula, in its order; of a kept value the one tag with its reads. These are the tags
     # of another tag's value: this tag is not read itself.
     inputs: tuple["Tag", ...] = ()
+    simulated: bool = False  # by a line with `port: simulator`
+
+    @property
+    def word(self) -> str | None:
+        """Returns the word of the contract; None: a plain reading of a device."""
+        if self.simulated:
+            return "simulated"
+        return None if self.formula is None else "computed"
 
 
 READ = Origin()
+_SIMULATED = Origin(simulated=True)
 _NO_LABEL = Label()
 
 
@@ -137,6 +146,11 @@ class Tag:
     def label(self) -> Label:
         return self.feature(Label) or _NO_LABEL
 
+    def as_simulated(self) -> "Tag":
+        """Returns the same tag of a simulated device."""
+        known = self.origin
+        return replace(self, origin=_SIMULATED if known is READ else replace(known, simulated=True))
+
     def copy(self, device: str, name: str) -> "Tag":
         """Returns the same tag under another name. Ten times faster than `replace`."""
         twin = object.__new__(Tag)
@@ -162,6 +176,11 @@ class Tag:
     def key(self) -> str:
         """Unique in the gateway: `device/name`."""
         return f"{self.device}/{self.name}"
+
+    @property
+    def recorded_key(self) -> str:
+        """The name of its samples in the history: simulated ones are never among real ones."""
+        return f"{self.key}@simulated" if self.origin.simulated else self.key
 
     @property
     def exact_below(self) -> float | None:

@@ -25,10 +25,10 @@ def test_write_direct(config: Path, as_json: bool) -> None:
     assert (done.code, done.err) == (0, "")
     if as_json:
         [answer] = documents(done.out)
-        assert set(answer) == {"value", "time", "verified", "acknowledged", "took"}
+        assert set(answer) == {"value", "time", "verified", "acknowledged", "took", "origin"}
         assert answer["time"].endswith("Z")
     else:
-        assert done.out.startswith("mixer/trim = -5: acknowledged and read back, ")
+        assert done.out.startswith("mixer/trim = -5: acknowledged and read back (simulated), ")
 
 
 def test_direct_reports_why_a_port_cannot_be_opened(tmp_path: Path) -> None:

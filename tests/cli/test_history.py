@@ -19,23 +19,23 @@ from tests.history_writer import tag
 
 HOUR = "[2026-11-21T12:00:00Z..2026-11-21T12:00:40Z["
 EXPORTED = """\
-time,tag,value,quality,reason
-2026-11-21T12:00:00.000000Z,mixer/speed,5.5,good,
-2026-11-21T12:00:10.000000Z,mixer/speed,,bad,no-reply
-2026-11-21T12:00:15.000000Z,mixer/name,"A, B",good,
-2026-11-21T12:00:20.000000Z,mixer/speed,18446744073709551615,good,
-2026-11-21T12:00:25.000000Z,mixer/name,,bad,no-reply
-2026-11-21T12:00:25.000000Z,mixer/steps,"[1, 2.5]",good,
+time,tag,value,quality,reason,origin
+2026-11-21T12:00:00.000000Z,mixer/speed,5.5,good,,
+2026-11-21T12:00:10.000000Z,mixer/speed,,bad,no-reply,
+2026-11-21T12:00:15.000000Z,mixer/name,"A, B",good,,
+2026-11-21T12:00:20.000000Z,mixer/speed,18446744073709551615,good,,
+2026-11-21T12:00:25.000000Z,mixer/name,,bad,no-reply,
+2026-11-21T12:00:25.000000Z,mixer/steps,"[1, 2.5]",good,,
 """
 BUCKETS = """\
-time;tag;quality;mean;last;good;bad;known;reason
-2026-11-21T12:00:00.000000Z;mixer/speed;partial;5,5;5,5;1;1;10,0;no-reply
+time;tag;quality;mean;last;good;bad;known;reason;origin
+2026-11-21T12:00:00.000000Z;mixer/speed;partial;5,5;5,5;1;1;10,0;no-reply;
 2026-11-21T12:00:20.000000Z;mixer/speed;partial;1,8446744073709552e+19;18446744073709551615;1;0;5,0;\
-not-recorded
-2026-11-21T12:00:00.000000Z;mixer/name;partial;;A, B;1;0;5,0;not-recorded
-2026-11-21T12:00:20.000000Z;mixer/name;partial;;A, B;0;1;5,0;no-reply
-2026-11-21T12:00:00.000000Z;mixer/steps;bad;;;0;0;0,0;not-recorded
-2026-11-21T12:00:20.000000Z;mixer/steps;partial;;[1, 2.5];1;0;0,0;not-recorded
+not-recorded;
+2026-11-21T12:00:00.000000Z;mixer/name;partial;;A, B;1;0;5,0;not-recorded;
+2026-11-21T12:00:20.000000Z;mixer/name;partial;;A, B;0;1;5,0;no-reply;
+2026-11-21T12:00:00.000000Z;mixer/steps;bad;;;0;0;0,0;not-recorded;
+2026-11-21T12:00:20.000000Z;mixer/steps;partial;;[1, 2.5];1;0;0,0;not-recorded;
 """
 
 
@@ -60,7 +60,7 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "name": {"address": "D600", "type": "string[8]"},
         "steps": {"address": "D20", "type": "float32[2]"},
     }
-    lines = {"hall": vigor_line("simulator", tags)}
+    lines = {"hall": vigor_line("/dev/ttyUSB0", tags)}
     where = {"path": str(tmp_path / "history.db")}
     return write_config(tmp_path / "plant.yaml", "tcp/127.0.0.1:0", lines, history=where)
 

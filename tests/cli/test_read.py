@@ -42,7 +42,9 @@ def test_read_prints_a_table(running: Path) -> None:
     header, *rows = done.out.splitlines()
     assert header.split() == ["tag", "value", "unit", "quality", "time"]
     assert [row.split()[0] for row in rows] == sorted(f"mixer/{name}" for name in TAGS)
-    assert [row.split()[2:4] for row in rows if row.startswith("mixer/speed")] == [["rpm", "good"]]
+    assert [row.split()[2:5] for row in rows if row.startswith("mixer/speed")] == [
+        ["rpm", "good,", "simulated"]
+    ]
 
 
 def test_read_as_json_prints_one_document_per_line(running: Path) -> None:

@@ -39,7 +39,7 @@ def test_a_healthy_gateway(running: Path) -> None:
     done = plc_gateway("status", running)
     assert (done.code, done.err) == (0, "")
     assert re.search(r"^demo \S+, up \d+ (s|min), 7 tags$", done.out, re.MULTILINE)
-    assert re.search(r"^hall +open +\d", done.out, re.MULTILINE)
+    assert re.search(r"^hall +simulated +\d", done.out, re.MULTILINE)
     assert re.search(r"^mixer +hall +up +\d+ ms", done.out, re.MULTILINE)
     assert re.search(r"^Zenoh +\d client", done.out, re.MULTILINE)
     assert re.search(r"^history +not kept", done.out, re.MULTILINE)

@@ -35,9 +35,9 @@ def test_a_table_of_good_and_bad_samples(tmp_path: Path) -> None:
     at = "2026-11-21T04:36:03.007430Z"
     assert header == ["tag", "value", "unit", "quality", "time"]
     assert lines == [
-        ["mixer/speed", "-7", "rpm", "good", at],
+        ["mixer/speed", "-7", "rpm", "good,", "simulated", at],
         ["mixer/speed", "-", "rpm", "bad:", "no-reply", at],
-        ["mixer/run", "false", "good", at],
+        ["mixer/run", "false", "good,", "simulated", at],
         ["other/tag", "[red]:boom:", "good", "now"],
     ]
 

@@ -54,7 +54,7 @@ def test_write_prints_the_reply_of_the_plc(
 ) -> None:
     done = plc_gateway("write", running, tag, typed)
     assert (done.code, done.err) == (0, "")
-    assert done.out.startswith(f"{tag} = {value}: {how}, ")
+    assert done.out.startswith(f"{tag} = {value}: {how} (simulated), ")
     assert done.out.endswith(" ms\n")
 
     def is_read() -> bool:  # a slow machine may miss a reply
@@ -68,7 +68,7 @@ def test_write_as_json(running: Path) -> None:
     done = plc_gateway("write", running, "mixer/trim", "-5", "--json")
     [answer] = documents(done.out)
     assert (done.code, answer["value"], answer["verified"]) == (0, -5, True)
-    assert set(answer) == {"value", "time", "verified", "acknowledged", "took"}
+    assert set(answer) == {"value", "time", "verified", "acknowledged", "took", "origin"}
 
 
 def test_a_write_to_a_tag_unknown_to_the_gateway_ends_with_2(newer: Path) -> None:

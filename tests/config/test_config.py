@@ -110,7 +110,8 @@ def only_tag(config: Config) -> Tag:
 
 M = "lines.hall.devices.mixer"
 TYPES = (
-    "bool, int8, uint8, int16, uint16, int32, uint32, int64, uint64, float32, float64, bcd16, bcd32"
+    "bool, int8, uint8, int16, uint16, int32, uint32, int64, uint64, float32, float64, bcd16, "
+    "bcd32, telephone"
 )
 
 

@@ -35,6 +35,7 @@ _SAMPLES = [
     Column("value", "value"),
     Column("quality", "word"),
     Column("reason", "word"),
+    Column("origin", "word"),
 ]
 
 
@@ -131,10 +132,12 @@ def _samples(
 
 
 def _row(sample: Sample) -> tuple[Any, ...]:
+    origin = sample.tag.origin.word
     if has_value(sample):
-        return sample.time, sample.tag.key, sample.value, "good", None
+        return sample.time, sample.tag.key, sample.value, "good", None, origin
     reason = Reason.NOT_A_NUMBER if sample.quality is Quality.GOOD else sample.reason
-    return sample.time, sample.tag.key, None, "bad", None if reason is None else reason.value
+    known = None if reason is None else reason.value
+    return sample.time, sample.tag.key, None, "bad", known, origin
 
 
 def _buckets(
@@ -162,6 +165,7 @@ def _buckets(
                     bucket.bad,
                     bucket.known / 1e9,
                     None if bucket.quality == "good" else bucket.reason,
+                    tag.origin.word,
                 )
         except Damaged as error:
             lost.append(error)
@@ -177,13 +181,14 @@ def _bucket_columns(asked: Question) -> list[Column]:
         Column("bad", "count"),
         Column("known", "number"),
         Column("reason", "word"),
+        Column("origin", "word"),
     ]
 
 
 def _tags(config: Config, names: list[str] | None) -> dict[str, Tag]:
     wanted = wanted_keys(config, names)
     tags = (tag for device in config.devices for tag in device.tags)
-    return {tag.key: tag for tag in tags if matches(tag.key, wanted)}
+    return {tag.recorded_key: tag for tag in tags if matches(tag.key, wanted)}
 
 
 def _path(config: Config, file: Path) -> Path:

@@ -62,6 +62,8 @@ class SheetTags:
         defaults: TagDefaults,
         driver: Addressing | None,
         taken: Collection[str],
+        *,
+        simulated: bool = False,
     ) -> tuple[Tag, ...]:
         """Returns the tags of a device in a sheet. `path`: of the setting that names the sheet."""
         grid = self._grid(self.folder / file, path)
@@ -78,7 +80,7 @@ class SheetTags:
         for name in sheet.tags.keys() & taken:
             mistakes.add((name, "name"), f"{name} is in `tags` of {device} already")
         builder = DeviceTags(mistakes)
-        tags = builder.build(device, sheet.tags, (), defaults, driver)
+        tags = builder.build(device, sheet.tags, (), defaults, driver, simulated=simulated)
         if builder.recorded is not None and self.recorded is None:
             self.recorded = path
         self.mistakes.include(mistakes)

@@ -125,7 +125,9 @@ class _Maker:
             layout=Layout(kind),
             every=min(one.every for one in inputs),
             origin=Origin(
-                formula=Formula(source.own.computed, parsed.term, whole), inputs=tuple(inputs)
+                formula=Formula(source.own.computed, parsed.term, whole),
+                inputs=tuple(inputs),
+                simulated=any(one.origin.simulated for one in inputs),
             ),
             **kept_by(source, facts),
         )

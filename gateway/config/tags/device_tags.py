@@ -36,11 +36,14 @@ class DeviceTags:
         path: Path,
         defaults: TagDefaults,
         driver: Addressing | None,
+        *,
+        simulated: bool = False,
     ) -> tuple[Tag, ...]:
         """Returns the tags of a device, without those that have mistakes."""
         alike: _Alike = {}
         if driver is not None:
-            alike = self._built.setdefault((model_of(driver), repr(defaults)), alike)
+            kind = model_of(driver), f"{defaults!r} {simulated}"
+            alike = self._built.setdefault(kind, alike)
         tags: list[Tag] = []
         seen: set[str] = set()
         # Once for all tags: the search for its methods takes a tenth of the time of a tag.
@@ -61,6 +64,7 @@ class DeviceTags:
             else:
                 before = len(self.mistakes)
                 tag = self._tag(device, name, raw, place, defaults, driver, fields)
+                tag = tag.as_simulated() if tag is not None and simulated else tag
                 if tag is not None and len(self.mistakes) == before:
                     alike[text] = tag
             if tag is not None:

@@ -136,7 +136,8 @@ class Write:
     ) -> WriteResult:
         """Returns the result. `now` by the line's clock, `time` in ns since 1970."""
         took, note = now - self.submitted, RACE if self._races else ""
-        return WriteResult(self.value, time, took, verified, acknowledged, note)
+        origin = self.tag.origin.word
+        return WriteResult(self.value, time, took, verified, acknowledged, note, origin)
 
 
 @dataclass(slots=True, eq=False)

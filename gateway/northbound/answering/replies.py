@@ -132,7 +132,7 @@ class Replies:
                     by_tag = (past.samples(history, tag, asked, limit, now, pause) for tag in tags)
                     self._samples(query, past.one_by_one(by_tag), pause)
                 elif tags:
-                    wanted = {tag.key: tag for tag in tags}
+                    wanted = {tag.recorded_key: tag for tag in tags}
                     place = pages.recorded_place(None if page is None else page.after)
                     recorded = RecordedQuery(wanted, asked.time_range, place, now)
                     found = history.as_recorded(recorded, pause)
@@ -163,7 +163,7 @@ class Replies:
 
         for tag, bucket in past.one_by_one(of(tag) for tag in tags):
             if bucket.quality == "good" or not asked.only_good:
-                document = buckets.document(bucket, asked.aggregates)
+                document = buckets.document(tag, bucket, asked.aggregates)
                 self._reply(query, self._keys.value(tag.key), document, self._stamp())
             go_on()
 

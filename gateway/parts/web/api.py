@@ -287,7 +287,7 @@ def _found(
 
     if asked.bucket is not None:
         whole = [
-            buckets.fields(bucket, asked.aggregates)
+            buckets.fields(tag, bucket, asked.aggregates)
             for bucket in history.buckets(tag, asked, now, pause)
             if bucket.quality == "good" or not asked.only_good
         ]

@@ -216,7 +216,8 @@ class Page:
             if name := fields.get("text"):
                 text = f"{name} ({text})"
             good = fields["quality"] == Quality.GOOD
-            why = "" if good else f"{fields['reason'] or ''} {fields.get('detail') or ''}".strip()
+            told = (fields.get("origin"),) if good else (fields["reason"], fields.get("detail"))
+            why = " ".join(str(one) for one in told if one)
             found.append([tag.name, text if good else "", good, sample.time // 10**6, why])
         return found
 

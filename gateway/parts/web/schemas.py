@@ -65,7 +65,13 @@ _QUALITY = choice("good", "bad")
 _NAME_OF_VALUE = _about(TEXT, "The name of the value, where `enum` has one")
 _NEXT = _about(_TEXT_OR_NULL, "`after` of the next page; null: this was the last")
 _SAMPLE = {"value": _VALUE, "quality": _QUALITY, "time": _about(TEXT, "UTC")}
-_SAMPLE_MORE = {"text": _NAME_OF_VALUE, "reason": _TEXT_OR_NULL, "detail": TEXT}
+_ORIGIN = _about(choice("simulated", "computed", None), "null or absent: a plain reading")
+_SAMPLE_MORE = {
+    "text": _NAME_OF_VALUE,
+    "reason": _TEXT_OR_NULL,
+    "detail": TEXT,
+    "origin": _ORIGIN,
+}
 
 SCHEMAS: Mapping[str, Schema] = {
     "Error": _record({"error": TEXT}, more=True),
@@ -204,6 +210,7 @@ SCHEMAS: Mapping[str, Schema] = {
             "mean": _about(_NUMBER_OR_NULL, "Weighted by time"),
             "last": _either(*_SCALAR, "array", "null"),
             "reason": _about(_TEXT_OR_NULL, "Of the last gap"),
+            "origin": _ORIGIN,
         },
     ),
     "Written": _record(
@@ -214,7 +221,10 @@ SCHEMAS: Mapping[str, Schema] = {
             "acknowledged": _about(FLAG, "false only for a broadcast"),
             "took": NUMBER,
         },
-        {"note": _about(TEXT, "What the client must know, such as a possible race")},
+        {
+            "note": _about(TEXT, "What the client must know, such as a possible race"),
+            "origin": _ORIGIN,
+        },
     ),
     "WrittenGroup": _record(
         {"tags": _by_name(ref("Written"), "By tag, in their order"), "took": NUMBER}

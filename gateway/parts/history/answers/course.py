@@ -50,9 +50,9 @@ class Course:
         self, tag: Tag, period: TimeRange, width: int, now: Now, pause: Pause
     ) -> Iterator[Bucket]:
         """Yields the buckets of a tag. Raises `BadValue`, `Busy`, and at the end `Damaged`."""
-        file, runs, newest = self._recent.find(tag.key)
+        file, runs, newest = self._recent.find(tag.recorded_key)
         stored = StoredRuns(self._reader, self._damage, file, period)
-        numbers = stored.numbers({tag.key: tag}, runs)
+        numbers = stored.numbers({tag.recorded_key: tag}, runs)
         look = _Look(self._recent, self._reader, self._damage, file, runs, newest, numbers, period)
         begin = look.before()
         parts = list[_Part]()  # in the order of recording

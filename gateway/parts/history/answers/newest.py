@@ -28,10 +28,10 @@ class Newest:
     ) -> Iterator[Sample]:
         """Yields the newest samples of the period, in the order of time. Raises `Damaged` at the
         end."""
-        file, sorted_runs, newest = self._recent.find(tag.key)
+        file, sorted_runs, newest = self._recent.find(tag.recorded_key)
         stored = StoredRuns(self._reader, self._damage, file, period)
         runs = stored.of(sorted_runs)
-        numbers = stored.numbers({tag.key: tag}, runs)
+        numbers = stored.numbers({tag.recorded_key: tag}, runs)
         # The order of recording decides between samples of one time.
         found = [
             (sample.time, len(runs) + place, sample)

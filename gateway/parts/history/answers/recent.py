@@ -121,7 +121,7 @@ class Recent:
                 if tag.element is not None:
                     run.longest -= tag.layout.type.count // ELEMENTS
                 run.samples.append(sample)
-                run.by_tag.setdefault(tag.key, []).append(sample)
+                run.by_tag.setdefault(tag.recorded_key, []).append(sample)
                 self.recorded += 1
                 self.latest = sample.time
 

@@ -33,10 +33,10 @@ class Search:
     def by_time(self, tag: Tag, period: TimeRange) -> Iterator[Sample]:
         """Yields the samples of a tag in the order of time. Raises `Busy`, and at the end
         `Damaged`."""
-        file, sorted_runs, newest = self._recent.find(tag.key)
+        file, sorted_runs, newest = self._recent.find(tag.recorded_key)
         stored = StoredRuns(self._reader, self.damage, file, period)
         runs = stored.of(sorted_runs)
-        numbers = stored.numbers({tag.key: tag}, runs)
+        numbers = stored.numbers({tag.recorded_key: tag}, runs)
         begun = False
 
         def group(run: SortedRun, places: Places) -> list[Sample]:
@@ -192,7 +192,7 @@ def _found(
     """Yields the samples of a run in memory, with their numbers."""
     for n in numbers:
         sample = samples[n]
-        if sample.tag.key in tags and period.first <= sample.time <= period.last:
+        if sample.tag.recorded_key in tags and period.first <= sample.time <= period.last:
             yield n, sample
         elif n % _MANY == 0:
             pause()

@@ -74,7 +74,7 @@ class HistoryFile:
 
     def store(self, number: int, samples: Sequence[Sample]) -> None:
         """Stores samples in the order of arrival; the first gets this number."""
-        self.store_rows(number, [(sample.tag.key, *to_row(sample)) for sample in samples])
+        self.store_rows(number, [(sample.tag.recorded_key, *to_row(sample)) for sample in samples])
 
     def store_rows(self, number: int, columns: Sequence[Salvaged]) -> None:
         """Stores rows of keys and samples in their order; the first gets this number."""

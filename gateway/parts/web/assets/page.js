@@ -449,7 +449,7 @@ function showValue(last) {
 
 function showQuality({ cells, last: [, , good, , why] }) {
   const isStale = document.body.classList.contains("stale");
-  cells[2].textContent = isStale ? "not live" : good ? "good" : `bad: ${why}`;
+  cells[2].textContent = isStale ? "not live" : !good ? `bad: ${why}` : why ? `good, ${why}` : "good";
   cells[2].className = isStale ? "" : good ? "good" : "bad";
 }
 
