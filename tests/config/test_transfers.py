@@ -34,6 +34,19 @@ def mistakes(*rows: Any) -> list[str]:
     return str(caught.value).splitlines()
 
 
+@pytest.mark.parametrize("end", ["speed", "half", ":D10", ":D10..D12"])
+def test_a_simulated_value_is_never_carried_to_a_real_device(end: str) -> None:
+    device = {"protocol": "vigor", "station": 1, "tags": TAGS}
+    lines = {
+        "test": {"port": "simulator", "devices": {"a": device}},
+        "hall": {"port": "/dev/ttyS0", "devices": {"b": device}},
+    }
+    source, target = (f"a{end}", f"b{end}") if end[0] == ":" else (f"a/{end}", "b/copy")
+    with pytest.raises(ConfigErrors, match=f"{source} is simulated: its values are never written"):
+        built({"lines": lines, "transfers": [row(source, target)]})
+    assert built({"lines": lines, "transfers": [row("b/speed", "a/copy")]}).transfers
+
+
 def row(source: str, target: str, **settings: Any) -> dict[str, Any]:
     return {"from": source, "to": target, **settings}
 
@@ -205,7 +218,7 @@ def test_a_field_of_a_frame_is_carried_and_one_that_is_only_written_is_not() -> 
     scale = frames | {"listen": {"w": weight}, "write": {"limit": put}, "tags": tags}
     line = {"port": "/dev/ttyS9", "devices": {"scale": scale}}
     plc = {"protocol": "vigor", "station": 1, "tags": TAGS}
-    lines = {"a": line, "b": {"port": "simulator", "devices": {"plc": plc}}}
+    lines = {"a": line, "b": {"port": "/dev/ttyS8", "devices": {"plc": plc}}}
     rows = [row("scale/weight", "plc/copy"), row("plc/speed", "scale/limit")]
     assert len(built({"lines": lines, "transfers": rows}).transfers) == 2
     with pytest.raises(ConfigErrors, match="scale/limit can only be written"):

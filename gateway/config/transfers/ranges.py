@@ -96,7 +96,10 @@ class Ranges:
             found.add(path, f"{tag.key} is the name of this range: give that tag another name")
         for problem in found.sentences():
             self.mistakes.add(path, problem)
-        return None if len(found) else tag
+        if tag is None or len(found):
+            return None
+        simulated = any(line.simulated for line in self.lines if device in line.devices)
+        return tag.as_simulated() if simulated else tag
 
     def added(self) -> list[LineConfig]:
         """Returns the lines with the tags of the ranges."""
