@@ -6,14 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from gateway.config.build import Builder
 from gateway.config.file_rules import check_files
 from gateway.config.messages import Mistakes, OptionPlaces
 from gateway.config.settings.records import Config
 from gateway.config.templates.expand import expanded
-from gateway.config.yaml.dump import dumped
 from gateway.config.yaml.file import TEXTS, read_yaml
+from gateway.config.yaml.scalars import scalar
 
 STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
 
@@ -80,3 +83,30 @@ def _without_gc() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes a text in quotes where the file would not be read as this text."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    is_text = text.isprintable() and text != "" and isinstance(scalar(text), str)
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if is_text else '"')
+
+
+_Dumper.add_representer(str, _text)
+
+
+def dumped(data: Mapping[str, Any]) -> str:
+    """Returns the text; the innermost settings are on one line."""
+    return yaml.dump(
+        dict(data),
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        default_flow_style=None,
+        width=10_000,  # a tag is one line
+    )

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import orjson
 import structlog
@@ -65,7 +65,8 @@ class SavedFile:
             self._save(snapshot)
 
     def _save(self, snapshot: bytes) -> None:
-        if snapshot == self._saved:
+        if snapshot == self._saved and self._path.exists():
+            self.trouble = None
             return
         temporary = self._path.with_name(self._path.name + ".new")
         try:
@@ -86,9 +87,11 @@ class SavedFile:
 
     # -- loading --
 
-    def load(self, parse: Callable[[object], T]) -> T | None:
-        """Returns the parsed content; None without a file. Moves a file aside that `parse` refuses
-        by ValueError, TypeError, KeyError or AttributeError."""
+    def load(
+        self, parse: Callable[[Any], T], decode: Callable[[bytes], object] = orjson.loads
+    ) -> T | None:
+        """Returns the parsed content; None without a file. Moves a file aside that `decode` or
+        `parse` refuse by ValueError, TypeError, KeyError or AttributeError."""
         try:
             data = files.read(self._path)
         except FileNotFoundError:
@@ -97,7 +100,7 @@ class SavedFile:
             log.warning("state file not read", file=str(self._path), why=str(error))
             return None
         try:
-            return parse(orjson.loads(data))
+            return parse(decode(data))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             self._move_aside(repr(error))
             return None

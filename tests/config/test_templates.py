@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.config import Config, ConfigErrors, expanded_text, load
+from gateway.config.loading import dumped
 from gateway.config.messages import Mistakes
 from gateway.config.templates.expand import expanded
 from gateway.config.templates.files import SHIPPED
 from gateway.config.templates.text import filled
-from gateway.config.yaml.dump import dumped
 from gateway.config.yaml.file import YamlFile, read_yaml
 from gateway.errors import ConfigError
 from gateway.tags import Tag

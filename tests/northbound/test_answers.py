@@ -6,8 +6,7 @@ from typing import Self, cast
 
 import zenoh
 
-from gateway.northbound.answering.answers import REFUSALS_LIMIT, AnswerPool
-from gateway.northbound.answering.workers import Workers
+from gateway.northbound.answering.answers import REFUSALS_LIMIT, AnswerPool, Workers
 
 PATIENCE = 300.0  # seconds; never waited for when all is well
 

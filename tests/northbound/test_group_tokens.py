@@ -5,8 +5,8 @@ from structlog.testing import capture_logs
 
 from gateway.contract.keys import Keys
 from gateway.northbound.group.election import Role, RoleToken
-from gateway.northbound.group.group_tokens import GroupTokens
 from gateway.northbound.group.plant_secret import PlantSecret
+from gateway.northbound.group.standby import GroupTokens
 
 ACTIVE = RoleToken(Role.ACTIVE, "a", "5e55")
 SECRET = PlantSecret("a secret of twenty or more")

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from gateway.service.reload.watch import STILL, Watch
+from gateway.service.reload.reloader import STILL, Watch
 
 
 def test_a_change_counts_when_the_file_stood_still(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Hot standby on Zenoh: declares and observes the liveliness tokens that `election` decides by."""
 
 import asyncio
+import hmac
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,9 +11,9 @@ import structlog
 import zenoh
 
 from gateway.contract.keys import Keys
+from gateway.contract.rate_limit import RateLimit
 from gateway.line.send_permit import Duty
 from gateway.northbound.group.election import Election, Role, RoleToken, State
-from gateway.northbound.group.group_tokens import GroupTokens
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.session.second_session import SecondSession
@@ -168,3 +169,42 @@ class Standby:
         harm."""
         handler = zenoh.handlers.Callback(replies, indirect=False)
         session.liveliness().get(self._group.all, handler, timeout=_QUERY_TIMEOUT)
+
+
+_SHOWN = 300  # characters of a refused key
+
+
+class GroupTokens:
+    """Makes keys, and parses those of other gateways."""
+
+    def __init__(self, keys: Keys, group: str, secret: PlantSecret | None) -> None:
+        """Without a `secret` tokens are not signed, and every token of the group counts."""
+        self._keys = keys
+        self._stem = keys.group(group)
+        self._secret = secret
+        self._log_limit = RateLimit(10, 60.0)  # any client can declare as many as it likes
+
+    @property
+    def all(self) -> str:
+        return f"{self._stem}/**"
+
+    def key(self, token: RoleToken) -> str:
+        key = f"{self._stem}/{token.role.value}/{token.name}/{token.session}"
+        return key if self._secret is None else f"{key}/{self._secret.signature(key)}"
+
+    def parse(self, key: str, now: float) -> RoleToken | None:
+        """Returns None, and logs the key, for a token that this group did not sign."""
+        match key.removeprefix(f"{self._stem}/").split("/"):
+            case [role, name, session, *signature] if role in list(Role):
+                token = RoleToken(Role(role), name, session)
+                if self._secret is None and len(signature) <= 1:
+                    return token
+                if self._secret and hmac.compare_digest(key.encode(), self.key(token).encode()):
+                    return token
+        if self._log_limit.allows(now):
+            log.error(
+                "standby token refused",
+                token=key[:_SHOWN],
+                why="it is not signed with the secret of this gateway",
+            )
+        return None

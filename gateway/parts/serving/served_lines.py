@@ -1,16 +1,18 @@
 """The served lines of a gateway, and the values that clients write for their masters."""
 
 import asyncio
+import json
 import time
 from collections.abc import Callable, Sequence
 
 import structlog
 
 from gateway.config import Config
-from gateway.errors import BadValue
+from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
-from gateway.parts.serving.held_file import HeldFile
+from gateway.parts.serving.held_file import parser, to_text
 from gateway.parts.serving.served_line import ServedLine, ServedSink
+from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
 from gateway.stations.served.registers import Registers, Row
 from gateway.stations.served.station import Station
@@ -44,7 +46,7 @@ class ServedLines:
         ]
         self._sink = sink
         self._wall = wall
-        self._file = None if config.held_file is None else HeldFile(config.held_file)
+        self._file = None if config.held_file is None else SavedFile(config.held_file)
         self._saving = asyncio.Lock()
         self._rows = {row.tag: row for one in self.stations for row in one.registers.served.rows}
         self._retained: dict[Tag, Value] = {}
@@ -90,7 +92,9 @@ class ServedLines:
             retained = {tag: real for tag, real in held.items() if self._rows[tag].retain}
             if retained and self._file is not None:
                 changed = self._retained | retained
-                await asyncio.to_thread(self._file.save, changed)
+                await asyncio.to_thread(self._file.save, to_text(changed))
+                if self._file.trouble is not None:
+                    raise Busy(f"it cannot be kept: {self._file.trouble}; not done")
                 self._retained = changed
             at = self._wall()
             self._sink.samples([good(tag, real, at) for tag, real in held.items()])
@@ -104,8 +108,10 @@ class ServedLines:
         """Publishes the held values of before the start."""
         if self._file is None:
             return
-        retained = [tag for tag, row in self._rows.items() if row.retain]
-        for tag, value in (await off_loop(self._file.load, retained)).items():
+        parse = parser([tag for tag, row in self._rows.items() if row.retain])
+        # Not orjson: it turns integers beyond 64 bits into floats.
+        found = await off_loop(self._file.load, parse, json.loads)
+        for tag, value in (found or {}).items():
             try:
                 real = tag.from_units(tag.encode(value))
             except BadValue as error:

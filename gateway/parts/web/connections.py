@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import cast
 
+from aiohttp import web
+
 MOST_CONNECTIONS = 256
 
 
@@ -86,3 +88,30 @@ def client_of(transport: asyncio.BaseTransport | None) -> str:
     """Returns the address of the client; empty if the connection was closed."""
     peer = transport.get_extra_info("peername") if transport is not None else None
     return str(peer[0]) if peer else ""
+
+
+class Places:
+    """A number of places, and how many of them one client may have."""
+
+    def __init__(self, most: int, of_client: int, called: str) -> None:
+        """`called`: what takes them, such as `requests`."""
+        self._most = most
+        self._of_client = of_client
+        self._called = called
+        self._taken: Counter[str] = Counter()
+
+    @contextmanager
+    def taken(self, client: str) -> Iterator[None]:
+        """Takes a place. Raises `HTTPServiceUnavailable` if there is none."""
+        if self._taken.total() >= self._most:
+            raise web.HTTPServiceUnavailable(reason=f"{self._most} {self._called} are open already")
+        if self._taken[client] >= self._of_client:
+            reason = f"{self._of_client} {self._called} of this address are open already"
+            raise web.HTTPServiceUnavailable(reason=reason)
+        self._taken[client] += 1
+        try:
+            yield
+        finally:
+            self._taken[client] -= 1
+            if not self._taken[client]:
+                del self._taken[client]

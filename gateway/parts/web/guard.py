@@ -15,8 +15,7 @@ from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
 from gateway.contract.access.named_secrets import NamedSecrets
-from gateway.parts.web.connections import Connections, client_of
-from gateway.parts.web.places import Places
+from gateway.parts.web.connections import Connections, Places, client_of
 from gateway.parts.web.replies import answer, send
 from gateway.parts.web.settings import WebSection
 

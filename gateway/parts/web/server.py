@@ -9,12 +9,13 @@ import json
 import logging
 import socket
 from contextlib import suppress
+from pathlib import Path
 
 import structlog
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from gateway.parts.web import assets, metrics, openapi
+from gateway.parts.web import metrics, openapi
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
@@ -30,6 +31,12 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 IDLE = 15.0  # seconds without a whole request until a connection is closed
 AGAIN = 10.0  # seconds until the address is tried again
 SCRAPE_AGE = 1.0  # seconds that the state in the metrics may be old
+_FOLDER = Path(__file__).parent / "assets"
+_FILES = {
+    "/": ("page.html", "text/html"),
+    "/page.js": ("page.js", "text/javascript"),
+    "/page.css": ("page.css", "text/css"),
+}
 _BACKLOG = 128  # connections that the system keeps until they are accepted
 _HEADER = 8190  # bytes of one line
 _ENDS_WITHIN = 0.2  # seconds for requests in progress when the gateway ends
@@ -68,11 +75,11 @@ class Server:
             ),
             *events.routes(),
             *self._probes(),
-            *assets.routes(),
+            *_page(),
         ]
         self.description = openapi.document(routes)
         text = json.dumps(self.description, indent=2).encode()
-        routes.append(assets.file("/openapi.json", text, "application/json"))
+        routes.append(_file("/openapi.json", text, "application/json"))
         is_open = frozenset(route.path for route in routes if route.is_open)
         self._app = web.Application(
             middlewares=[guard.middleware(is_open)], client_max_size=64 * 1024
@@ -186,3 +193,18 @@ class Server:
 
         body = await off_loop(text)
         return web.Response(body=body, headers={"Content-Type": metrics.CONTENT_TYPE})
+
+
+def _page() -> list[Route]:
+    return [
+        _file(path, (_FOLDER / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()
+    ]
+
+
+def _file(path: str, body: bytes, kind: str) -> Route:
+    """Returns the route of a file: it holds no value, so it is open."""
+
+    async def asset(_: web.Request) -> web.Response:
+        return web.Response(body=body, content_type=kind, charset="utf-8")
+
+    return Route(path, asset, is_open=True)

@@ -1,16 +1,17 @@
 """Reads the changed file, refuses a bad one, and tells what became of it."""
 
 import asyncio
+import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import structlog
 
+from gateway import files as disk
 from gateway.config import Config, ConfigErrors, load
 from gateway.config.changes import Difference, needs_restart
 from gateway.plant.threads import off_loop
-from gateway.service.reload.watch import LOOK_EVERY, Watch
 from gateway.tags.timestamps import rfc3339
 
 log = structlog.get_logger("gateway")
@@ -108,3 +109,53 @@ class Reloader:
             return str(error).splitlines()
         changed = needs_restart(self.current, config)
         return [f"{self._path}: {one} changed: this needs a restart" for one in changed] or config
+
+
+STILL = 1.0  # seconds
+LOOK_EVERY = 0.5  # seconds
+
+_State = tuple[int, int, int]  # of a file: when it was written, size, number
+
+
+class Watch:
+    """The content of some files when they were read last. Every call reads the disk."""
+
+    def __init__(self) -> None:
+        self._read: Mapping[Path, bytes] = {}
+        self._seen: Mapping[Path, _State | None] = {}
+        self._since: float | None = None  # when the last change was seen; None: it is dealt with
+
+    def note(self, files: Iterable[Path]) -> None:
+        """Notes the content that is about to be read."""
+        files = [*files]
+        self._seen = {file: _state(file) for file in files}
+        self._read = {file: _digest(file) for file in files}
+        self._since = None
+
+    def changed(self, files: Iterable[Path], now: float) -> bool:
+        """Returns True once for a change. `now`: in seconds of a steady clock."""
+        seen = {file: _state(file) for file in files}
+        if seen != self._seen:
+            self._seen, self._since = seen, now
+        if self._since is None or now - self._since < STILL:
+            return False
+        self._since = None
+        read = {file: _digest(file) for file in seen}
+        before, self._read = self._read, read
+        return read != before
+
+
+def _state(file: Path) -> _State | None:
+    """Follows links: some replace a folder of files by another one."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+def _digest(file: Path) -> bytes:
+    try:
+        return hashlib.sha256(disk.read(file)).digest()
+    except OSError:
+        return b""
