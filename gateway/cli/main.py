@@ -38,7 +38,7 @@ _COMMANDS = {
     "audit": "audit:audit",
     "trace": "trace:trace",
     "replay": "line.replay:replay",
-    "backup": "history.backup:backup",
+    "backup": "history.history:backup",
     "schema": "main:schema",
     "version": "main:version",
     "history": "history.history:cli",

@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from gateway.config.messages import Mistakes, OptionPlaces
 from gateway.config.settings import parsers
-from gateway.config.settings.session_files import with_files
-from gateway.config.settings.zenoh_records import LISTEN, NAME, TlsConfig, ZenohConfig, ZenohMode
+from gateway.config.settings.zenoh_records import (
+    LISTEN,
+    NAME,
+    TlsConfig,
+    ZenohConfig,
+    ZenohMode,
+    with_files,
+)
 from gateway.config.yaml.events import first_sections
 from gateway.config.yaml.file import TEXTS, file_text
 from gateway.errors import ConfigError

@@ -12,8 +12,8 @@ from gateway.config.settings import parsers
 from gateway.config.settings.model import DeviceSection, LineSection
 from gateway.config.settings.records import Config, LineConfig
 from gateway.config.settings.sections import Place, file_section, placed
-from gateway.config.settings.session_files import existing_file, with_files
 from gateway.config.settings.validate import driver_of, driver_settings, protocols, section, unknown
+from gateway.config.settings.zenoh_records import existing_file, with_files
 from gateway.config.sheets.tags import SheetTags
 from gateway.config.tags.arrays import check_overlaps
 from gateway.config.tags.computed import check_totals, with_computed

@@ -25,8 +25,7 @@ from gateway.northbound.publishing.publisher import Publisher, ScanBatches
 from gateway.northbound.publishing.republish import Republisher
 from gateway.northbound.publishing.status_publisher import StatusPublisher
 from gateway.northbound.publishing.traces import Traces
-from gateway.northbound.requests.acceptance import Acceptance
-from gateway.northbound.requests.accepted import AcceptedUntil
+from gateway.northbound.requests.acceptance import Acceptance, AcceptedUntil
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gateway.cli.sheets.export import export
-from gateway.cli.sheets.import_transfers import import_transfers
+from gateway.cli.sheets.import_command import import_transfers
 from gateway.config import load
 from gateway.errors import ConfigError
 from tests.sheets.test_link_table import LINK, LINK_REGISTERS, MBUS, registers

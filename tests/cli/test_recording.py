@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.line.recording import FILES, Recording
+from gateway.cli.trace import FILES, Recording
 from gateway.errors import GatewayError
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries, event_lines
 

@@ -9,7 +9,7 @@ from structlog.testing import capture_logs
 
 from gateway.contract.status import refused_sentence
 from gateway.engine.device.device import Device
-from gateway.parts.state.state_file import StateFile
+from gateway.parts.state.part import StateFile
 from tests.e2e.processes import PATIENCE
 from tests.sim.plant import device, make_tag
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from gateway.config import LineConfig, built
 from gateway.errors import LineDown
+from gateway.parts.serving.part import served_documents
 from gateway.parts.serving.served_line import ServedLine
-from gateway.parts.serving.status import served_documents
 from gateway.stations.served.station import Station
 from gateway.tags import Quality, Sample
 from gateway.transport import ModemAddress, Port, PortAddress, Receiver, SerialSettings, open_modem

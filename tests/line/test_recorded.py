@@ -3,7 +3,7 @@
 import asyncio
 from pathlib import Path
 
-from gateway.cli.line.replay_serve import report, stations_of
+from gateway.cli.line.replay import report, stations_of
 from gateway.config import LineConfig, built, load
 from gateway.parts.recording.recorded import courses, of_units, stations_asked, timed
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries

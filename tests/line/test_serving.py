@@ -65,7 +65,7 @@ async def test_a_value_that_cannot_be_kept_is_refused_and_not_shown(tmp_path: Pa
     await write(one, tag(one, "limit"), 42)
     (tmp_path / "state.held.json").unlink()
     tmp_path.rmdir()
-    with pytest.raises(Busy, match="No such file or directory.*; not done"):
+    with pytest.raises(Busy, match=r"No such file or directory.*; not done"):
         await write(one, tag(one, "limit"), 43)
     assert one.sample(tag(one, "limit")).value == 42
     with pytest.raises(BadValue):

@@ -24,7 +24,7 @@ from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question
 from gateway.errors import ConfigError, NotAllowed, Repeated
 from gateway.northbound.northbound import Files
-from gateway.northbound.requests.accepted import AcceptedUntil
+from gateway.northbound.requests.acceptance import AcceptedUntil
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339

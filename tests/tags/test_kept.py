@@ -6,7 +6,7 @@ import pytest
 
 from gateway.config import ConfigErrors, load
 from gateway.contract.meta import meta_fields
-from gateway.parts.state.state_file import StateFile
+from gateway.parts.state.part import StateFile
 from gateway.tags import Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.kept import CounterState
 from gateway.tags.mirror import Mirror

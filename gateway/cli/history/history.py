@@ -1,4 +1,4 @@
-"""The `history` commands: recorded samples as CSV or Parquet, and a history that was damaged."""
+"""The `history` commands, and `backup`: recorded samples as CSV or Parquet, a damaged history."""
 
 import sys
 import time
@@ -19,6 +19,7 @@ from gateway.errors import Damaged, GatewayError
 from gateway.parts.history.answers.course import Course
 from gateway.parts.history.answers.search import Search
 from gateway.parts.history.files.aside import asides, rename
+from gateway.parts.history.files.backup import backup as copied
 from gateway.parts.history.files.offline import offline
 from gateway.parts.history.files.salvage import salvage as salvaged
 from gateway.parts.history.settings import HistorySection
@@ -112,6 +113,16 @@ def known(config: ConfigPath) -> None:
             err.print(f"{one} is {rename(one, 'known').name} now")
         except OSError as error:
             raise GatewayError(f"{one} was not renamed: {error.strerror}") from None
+
+
+def backup(
+    config: ConfigPath,
+    copy: Annotated[Path, typer.Argument(metavar="COPY", help="A file that does not exist yet.")],
+) -> None:
+    """Copy the history to a file. The gateway may run: nothing waits for it."""
+    loaded = load(config)
+    size = copied(_path(loaded, config), copy)
+    print(f"{copy}: {size / 1e6:.1f} MB")
 
 
 def _samples(

@@ -14,8 +14,8 @@ from pydantic import create_model
 
 from gateway.config.messages import Mistakes, Path
 from gateway.config.settings.model import FileSection
-from gateway.config.settings.session_files import existing_file
 from gateway.config.settings.session_model import Section
+from gateway.config.settings.zenoh_records import existing_file
 from gateway.tags import Tag
 
 REGISTRY = "gateway.parts.registry"

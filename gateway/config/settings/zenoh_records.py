@@ -1,10 +1,12 @@
-"""The settings of the Zenoh session, as plain data."""
+"""The settings of the Zenoh session, as plain data, with the files that they name."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from pathlib import Path
+from pathlib import Path as FilePath
 
+from gateway.config.messages import Mistakes, Path
 from gateway.errors import ConfigError
+from gateway.files import is_file
 
 NAME = "gateway"  # of a gateway without one in the file
 LISTEN = ("tcp/127.0.0.1:7447",)  # where the file says nothing
@@ -20,9 +22,9 @@ class ZenohMode(StrEnum):
 class TlsConfig:
     """Certificates (PEM files). `mutual`: both sides show one."""
 
-    ca: Path | None = None  # certificate authority to trust
-    certificate: Path | None = None
-    key: Path | None = None
+    ca: FilePath | None = None  # certificate authority to trust
+    certificate: FilePath | None = None
+    key: FilePath | None = None
     mutual: bool = False
 
     def check(self) -> None:
@@ -45,14 +47,49 @@ class ZenohConfig:
     mode: ZenohMode = ZenohMode.PEER
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
-    config_file: Path | None = None
+    config_file: FilePath | None = None
     tls: TlsConfig | None = None
     user: str | None = None  # of this gateway, where it connects to
-    password_file: Path | None = None
-    users_file: Path | None = None  # for those who connect: a line `user:password` each
+    password_file: FilePath | None = None
+    users_file: FilePath | None = None  # for those who connect: a line `user:password` each
     refresh: float = 600.0  # seconds in which every value is published at least once
 
     def check(self) -> None:
         """Raises `ConfigError` for settings that do not go together."""
         if self.password_file is not None and self.user is None:
             raise ConfigError("password_file has no effect without user")
+
+
+def with_files(found: ZenohConfig, folder: FilePath, mistakes: Mistakes) -> ZenohConfig:
+    """Returns the session with its paths below `folder`; notes each file that is not there."""
+
+    def file(name: FilePath | None, *place: str) -> FilePath | None:
+        return existing_file(name, folder, ("zenoh", *place), mistakes)
+
+    tls = found.tls
+    if tls is not None:
+        tls = replace(
+            tls,
+            ca=file(tls.ca, "tls", "ca"),
+            certificate=file(tls.certificate, "tls", "certificate"),
+            key=file(tls.key, "tls", "key"),
+        )
+    return replace(
+        found,
+        config_file=file(found.config_file, "config_file"),
+        tls=tls,
+        password_file=file(found.password_file, "password_file"),
+        users_file=file(found.users_file, "users_file"),
+    )
+
+
+def existing_file(
+    name: FilePath | None, folder: FilePath, path: Path, mistakes: Mistakes
+) -> FilePath | None:
+    """Returns the path of a file that must exist."""
+    if name is None:
+        return None
+    file = folder / name
+    if not is_file(file):
+        mistakes.add(path, f"there is no file {file}")
+    return file

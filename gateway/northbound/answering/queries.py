@@ -24,9 +24,8 @@ from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounte
 from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests.acceptance import encoding_of, sender
-from gateway.northbound.requests.commands import Commands
+from gateway.northbound.requests.commands import Commands, Orders
 from gateway.northbound.requests.inbox import Inbox
-from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
 from gateway.tags import Tag
 

@@ -10,7 +10,7 @@ from gateway.contract import payload
 from gateway.contract.interfaces import History, Parts, Plant
 from gateway.contract.keys import Family, Keys, ParsedKey
 from gateway.contract.meta import meta
-from gateway.contract.past import bucket_documents as buckets
+from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question, question

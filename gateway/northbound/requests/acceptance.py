@@ -4,18 +4,26 @@ import asyncio
 import time
 from collections.abc import Callable
 from datetime import datetime
+from pathlib import Path
 from typing import NamedTuple
 
+import orjson
 import zenoh
 
 from gateway.contract.access.signatures import LONGEST
-from gateway.contract.access.writers import Writers
+from gateway.contract.access.writers import EARLIEST, LATEST, Writers
 from gateway.contract.foreign import Foreign
 from gateway.contract.parsing import check_encoding
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
-from gateway.northbound.requests.accepted import AcceptedUntil
+from gateway.plant.saved_file import SavedFile
+from gateway.plant.threads import off_loop
+
+AHEAD = LATEST + EARLIEST  # seconds
+# Seconds that a write waits for the disk. A disk that hangs or is full keeps no operator from
+# writing.
+_PATIENCE = 0.5
 
 
 class Sender(NamedTuple):
@@ -35,6 +43,42 @@ class Accepted(NamedTuple):
 
     by: str | None
     within: float
+
+
+class AcceptedUntil:
+    """Keeps on disk until when signatures were accepted, so that a restart accepts none again.
+
+    The time on disk is always later than that of any accepted signature, by some seconds. So most
+    writes do not wait for the disk. Belongs to the event loop.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = SavedFile(path)
+        # The time until which an earlier process may have accepted, in seconds since 1970.
+        self.floor = self._file.load(_parse) or 0.0
+        self._kept = self.floor
+        self._saving: asyncio.Task[None] | None = None
+
+    async def keep(self, newest: float) -> None:
+        """Returns when a restart refuses a signature of this time, or the disk took too long."""
+        if newest <= self._kept:
+            return
+        if self._saving is None or self._saving.done():
+            self._saving = asyncio.create_task(self._save(newest + AHEAD))
+        await asyncio.wait([self._saving], timeout=_PATIENCE)
+
+    async def _save(self, until: float) -> None:
+        await off_loop(self._file.save, orjson.dumps({"accepted_until": until}))
+        if self._file.trouble is None:
+            self._kept = until
+
+
+def _parse(found: object) -> float:
+    """Raises `ValueError`."""
+    match found:
+        case {"accepted_until": int() | float() as until} if 0 <= until < 2**36:
+            return float(until)
+    raise ValueError("no time of accepted signatures")
 
 
 class Acceptance:

@@ -14,9 +14,8 @@ from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
-from gateway.northbound.requests.commands import Commands
+from gateway.northbound.requests.commands import Commands, Orders
 from gateway.northbound.requests.inbox import Inbox
-from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import OwnWrites, PutWrites, Writes
 from gateway.tags import WriteResult
 

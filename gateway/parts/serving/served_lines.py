@@ -3,14 +3,14 @@
 import asyncio
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import structlog
 
 from gateway.config import Config
 from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
-from gateway.parts.serving.held_file import parser, to_text
 from gateway.parts.serving.served_line import ServedLine, ServedSink
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
@@ -121,3 +121,32 @@ class ServedLines:
                 self._retained[tag] = real
         at = self._wall()
         self._sink.samples([good(tag, value, at) for tag, value in self._retained.items()])
+
+
+FORMAT = 1
+_SCALARS = (bool, int, float, str)
+
+
+def to_text(values: Mapping[Tag, Value]) -> bytes:
+    """Returns the content of the file."""
+    held = {tag.key: value for tag, value in values.items()}
+    return json.dumps({"form": FORMAT, "held": held}, indent=2).encode()
+
+
+def parser(tags: Iterable[Tag]) -> Callable[[Any], dict[Tag, Value]]:
+    """Returns the parser of the file: it finds the values of the tags that still exist."""
+
+    def parse(document: Any) -> dict[Tag, Value]:
+        if document["form"] != FORMAT:
+            raise ValueError("no file of held values")
+        held = document["held"]
+        known = {tag: _value(held[tag.key]) for tag in tags if tag.key in held}
+        return {tag: value for tag, value in known.items() if value is not None}
+
+    return parse
+
+
+def _value(value: object) -> Value | None:
+    if isinstance(value, list) and all(isinstance(one, _SCALARS) for one in value):
+        return tuple(value)
+    return value if isinstance(value, _SCALARS) else None

@@ -17,7 +17,7 @@ from gateway.contract import payload
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.interfaces import History
 from gateway.contract.meta import meta_fields
-from gateway.contract.past import bucket_documents as buckets
+from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Now
 from gateway.contract.past.question import question
