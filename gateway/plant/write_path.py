@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from gateway.engine.device.device import Device
@@ -26,23 +27,15 @@ class Store(Protocol):
         """Raises `BadValue` and `Busy` before anything changed."""
 
 
+@dataclass(eq=False)
 class WritePath:
     """Writes, commands and peeks. Each raises `BadValue` before anything is sent, and otherwise a
     `GatewayError`."""
 
-    def __init__(
-        self,
-        places: Mapping[str, tuple[Line, Device]],
-        tags: Mapping[str, Tag],
-        stores: Sequence[Store],
-        wall: Callable[[], int],
-    ) -> None:
-        """`places`: of each device; `tags`: by key. Both change with a reload, `stores` with the
-        parts."""
-        self._places = places
-        self._tags = tags
-        self._stores = stores
-        self._wall = wall
+    _places: Mapping[str, tuple[Line, Device]]
+    _tags: Mapping[str, Tag]
+    _stores: Sequence[Store]
+    _wall: Callable[[], int]
 
     async def write_group(
         self,

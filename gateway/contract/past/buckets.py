@@ -7,6 +7,7 @@ no mean, and a bucket with a gap is never `good`.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import orjson
@@ -60,33 +61,21 @@ class Now(NamedTuple):
     is_valid: bool
 
 
+@dataclass(slots=True)
 class _Open:
     """The bucket that gets samples now."""
 
-    __slots__ = (
-        "bad",
-        "good",
-        "has_begun",
-        "known",
-        "last",
-        "max",
-        "mean",
-        "min",
-        "reason",
-        "start",
-        "time",
-    )
-
-    def __init__(self, time: int, start: int) -> None:
-        self.time = time
-        self.start = start
-        self.known = self.good = self.bad = 0
-        self.min: Scalar | None = None
-        self.max: Scalar | None = None
-        self.mean = 0.0
-        self.last: Value | None = None
-        self.reason: str | None = None
-        self.has_begun = False  # the value at its beginning counts only if it stays valid
+    time: int
+    start: int
+    known: int = 0
+    good: int = 0
+    bad: int = 0
+    min: Scalar | None = None
+    max: Scalar | None = None
+    mean: float = 0.0
+    last: Value | None = None
+    reason: str | None = None
+    has_begun: bool = False  # the value at its beginning counts only if it stays valid
 
     def enter(self, value: Value) -> None:
         """The value is valid from now on."""

@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -22,14 +23,14 @@ MOST_WAITING = 2000  # events of one put; those beyond are counted
 Put = Callable[[str, bytes], None]
 
 
+@dataclass(eq=False)
 class Traces:
     """Watches a line from the first subscriber of its trace to the end of the last."""
 
-    def __init__(self, keys: Keys, lines: Lines, put: Put) -> None:
-        self._keys = keys
-        self._lines = lines
-        self._put = put
-        self._tapped: dict[str, Tap] = {}
+    _keys: Keys
+    _lines: Lines
+    _put: Put
+    _tapped: dict[str, "Tap"] = field(default_factory=dict)
 
     def declare(self, session: zenoh.Session, inbox: Inbox[tuple[str, bool]]) -> list[object]:
         """Declares the traces. Blocks: not on the event loop. The caller keeps the results."""

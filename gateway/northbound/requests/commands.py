@@ -7,6 +7,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from gateway.config.commands import TO_ALL, NotControlled
 from gateway.contract import payload
@@ -22,21 +23,14 @@ from gateway.northbound.requests.writes import ANSWER_WITHIN
 _LONGEST_ARGUMENT = 1000  # bytes; a loopback takes 254 characters at most
 
 
+@dataclass(eq=False)
 class Commands:
     """Bounded by the open queries and by the requests that may wait for a line."""
 
-    def __init__(
-        self,
-        keys: Keys,
-        plant: Plant,
-        audit: Callable[[WriteOutcome], None],
-        acceptance: Acceptance,
-    ) -> None:
-        """`audit` gets every outcome."""
-        self._keys = keys
-        self._plant = plant
-        self._audit = audit
-        self._acceptance = acceptance
+    _keys: Keys
+    _plant: Plant
+    _audit: Callable[[WriteOutcome], None]  # gets every outcome
+    _acceptance: Acceptance
 
     async def execute(
         self, key: str, data: bytes | None, sender: Sender
@@ -98,15 +92,14 @@ def _line_of(key: str, own: str) -> str | None:
     return None
 
 
+@dataclass(eq=False)
 class Orders:
     """Passes orders on. Belongs to the event loop."""
 
-    def __init__(self, keys: Keys, parts: Parts, audit: Audit, acceptance: Acceptance) -> None:
-        """`audit` gets each refusal."""
-        self._keys = keys
-        self._parts = parts
-        self._audit = audit
-        self._acceptance = acceptance
+    _keys: Keys
+    _parts: Parts
+    _audit: Audit  # gets each refusal
+    _acceptance: Acceptance
 
     async def execute(self, part: str, key: str, data: bytes, sender: Sender) -> bytes | Failure:
         """Returns the new document. `key`, `data`: as received."""

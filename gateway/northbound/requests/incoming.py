@@ -1,7 +1,7 @@
 """Everything that clients send to this gateway: queries and puts, from declaration to end."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import TypeVar
 
 import zenoh
@@ -130,29 +130,21 @@ class Incoming:
             self._queries.end()
 
 
+@dataclass(eq=False)
 class Declarations:
     """Declares queryables, subscribers and tokens. Each call blocks: not on the event loop.
 
     Zenoh undeclares an object that is no longer referenced, so this one must live as long.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        keys: Keys,
-        plant: Plant,
-        index: TagIndex,
-        queries: Callable[[zenoh.Query], None],
-        puts: Inbox[zenoh.Sample],
-    ) -> None:
-        self._session = session
-        self._keys = keys
-        self._plant = plant
-        self._index = index
-        self._queries = queries
-        self._puts = puts
-        self._queryables: dict[str, zenoh.Queryable[None]] = {}  # by key
-        self._others: list[object] = []
+    _session: zenoh.Session
+    _keys: Keys
+    _plant: Plant
+    _index: TagIndex
+    _queries: Callable[[zenoh.Query], None]
+    _puts: Inbox[zenoh.Sample]
+    _queryables: dict[str, zenoh.Queryable[None]] = field(default_factory=dict)  # by key
+    _others: list[object] = field(default_factory=list)
 
     def status(self) -> None:
         """Declares the status keys; a standby gateway answers them too."""

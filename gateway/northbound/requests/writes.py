@@ -11,7 +11,7 @@ not sent.
 import asyncio
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import structlog
 import zenoh
@@ -57,22 +57,15 @@ def _asked(key: str, data: bytes, *, is_group: bool) -> list[_Asked]:
     return [_Asked(target, target, parsed(parse_write, data))]
 
 
+@dataclass(eq=False)
 class Writes:
     """Bounded: with `MOST_WAITING` writes waiting, the next is refused as busy."""
 
-    def __init__(
-        self,
-        plant: Plant,
-        index: TagIndex,
-        audit: Callable[[WriteOutcome], None],
-        acceptance: Acceptance,
-    ) -> None:
-        """`audit` gets the outcome of each tag."""
-        self._plant = plant
-        self._index = index
-        self._audit = audit
-        self._acceptance = acceptance
-        self._waiting = 0
+    _plant: Plant
+    _index: TagIndex
+    _audit: Callable[[WriteOutcome], None]  # gets the outcome of each tag
+    _acceptance: Acceptance
+    _waiting: int = 0
 
     async def write(
         self, key: str, data: bytes | None, sender: Sender
@@ -158,13 +151,13 @@ class Writes:
             one.result = payload.failure(end) if isinstance(end, GatewayError) else end
 
 
+@dataclass(eq=False)
 class OwnWrites:
     """Writes of the gateway itself, for its transfers: the rules and audit of a client's write."""
 
-    def __init__(self, keys: Keys, plant: Plant, audit: Audit) -> None:
-        self._keys = keys
-        self._plant = plant
-        self._audit = audit
+    _keys: Keys
+    _plant: Plant
+    _audit: Audit
 
     async def write(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
         """Returns when the device has acknowledged. After `within` seconds nothing is sent.
@@ -191,14 +184,14 @@ class OwnWrites:
         return ended
 
 
+@dataclass(eq=False)
 class PutWrites:
     """Writes by a plain put. A put has no reply, so the outcome is only audited."""
 
-    def __init__(self, writes: Writes, index: TagIndex) -> None:
-        self.refused = 0  # because the inbox was full
-        self._writes = writes
-        self._index = index
-        self._tasks: set[asyncio.Task[object]] = set()
+    _writes: Writes
+    _index: TagIndex
+    refused: int = 0  # because the inbox was full
+    _tasks: set[asyncio.Task[object]] = field(default_factory=set)
 
     def take(self, put: zenoh.Sample, at: float) -> None:
         """Called on the event loop. `at`: when the put arrived."""

@@ -7,6 +7,7 @@ import asyncio
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import structlog
 
@@ -21,25 +22,20 @@ from gateway.values import Value
 log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
 
 
+_UNKNOWN = Reading(None)
+
+
+@dataclass(slots=True, eq=False)
 class Entry:
     """One alarm. `key`: `device/tag`, `device`, or `line:name`. `tag`: None for the last two."""
 
-    __slots__ = ("alarm", "counted", "key", "look", "reading", "tag", "timer")
-
-    def __init__(
-        self,
-        key: str,
-        rule: AlarmRule,
-        tag: Tag | None = None,
-        look: Callable[[], Reading] | None = None,
-    ) -> None:
-        self.key = key
-        self.alarm = Alarm(rule)
-        self.counted = State.NORMAL
-        self.tag = tag
-        self.look = look  # only for lines and devices
-        self.reading = Reading(None)  # what it returned last
-        self.timer: asyncio.TimerHandle | None = None  # of the delay
+    key: str
+    alarm: Alarm
+    tag: Tag | None = None
+    look: Callable[[], Reading] | None = None  # only for lines and devices
+    reading: Reading = _UNKNOWN  # what it returned last
+    counted: State = State.NORMAL
+    timer: asyncio.TimerHandle | None = None  # of the delay
 
     @property
     def status(self) -> Status:
@@ -65,7 +61,7 @@ class Alarms:
         self._wall = wall
         for tag in tags:
             if (rule := tag.feature(AlarmRule)) is not None:
-                self._by_tag[tag] = self._add(Entry(tag.key, rule, tag))
+                self._by_tag[tag] = self._add(Entry(tag.key, Alarm(rule), tag))
         self.of_tags = bool(self._by_tag)  # then samples are to be judged
 
     def watch(self, conditions: Mapping[str, Condition]) -> None:
@@ -79,7 +75,9 @@ class Alarms:
             if (known := self.entries.get(key)) is not None:
                 known.look = condition.look  # another line or device may have its place
             else:
-                self._watched.append(self._add(Entry(key, condition.rule, look=condition.look)))
+                self._watched.append(
+                    self._add(Entry(key, Alarm(condition.rule), look=condition.look))
+                )
 
     # -- a changed file --
 
@@ -92,7 +90,7 @@ class Alarms:
             if entry is None or entry.tag is None or entry.tag.feature(AlarmRule) != rule:
                 if entry is not None:
                     self._remove(entry)
-                entry = self._add(Entry(tag.key, rule, tag))
+                entry = self._add(Entry(tag.key, Alarm(rule), tag))
             entry.tag = tag
             self._by_tag[tag] = entry
         for tag in gone:

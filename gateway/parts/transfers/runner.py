@@ -4,6 +4,7 @@ import asyncio
 import math
 from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
 
@@ -82,16 +83,16 @@ class _Running:
         return f"transfer {self.rule.number}"
 
 
+@dataclass(eq=False)
 class Transfers:
     """The rows of the file, a `Subscriber` of the gateway. Belongs to the event loop."""
 
-    def __init__(self, plant: Plant, write: Write, rules: Sequence[TransferRule]) -> None:
-        self._plant = plant
-        self._write = write
-        self._rules = rules
-        self._running: list[_Running] = []
-        self._by_source: dict[Tag, list[_Running]] = {}
-        self._ending: set[asyncio.Task[None]] = set()
+    _plant: Plant
+    _write: Write
+    _rules: Sequence[TransferRule]
+    _running: list[_Running] = field(default_factory=list)
+    _by_source: dict[Tag, list[_Running]] = field(default_factory=dict)
+    _ending: set[asyncio.Task[None]] = field(default_factory=set)
 
     # -- life --
 

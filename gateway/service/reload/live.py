@@ -3,6 +3,7 @@
 import asyncio
 import gc
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from gateway.config import Config
 from gateway.config.changes import Difference, compare
@@ -16,27 +17,17 @@ from gateway.service.reload.renewal import Renewal
 from gateway.service.supervisor import Supervisor
 
 
+@dataclass(eq=False)
 class LiveReload:
     """The reloads of one gateway, one after another."""
 
-    def __init__(
-        self,
-        reloader: Reloader,
-        plant: Plant,
-        northbound: Northbound,
-        lines: RunningLines,
-        plans: Sequence[asyncio.Task[None]],
-        supervisor: Supervisor,
-        parts: Bulkheads,
-    ) -> None:
-        """`plans` end when every line is planned."""
-        self._reloader = reloader
-        self._plant = plant
-        self._northbound = northbound
-        self._lines = lines
-        self._plans = plans
-        self._supervisor = supervisor
-        self._parts = parts
+    _reloader: Reloader
+    _plant: Plant
+    _northbound: Northbound
+    _lines: RunningLines
+    _plans: Sequence[asyncio.Task[None]]
+    _supervisor: Supervisor
+    _parts: Bulkheads
 
     async def run(self) -> None:
         """Runs until cancelled. A gateway that is not active starts over with a good file."""

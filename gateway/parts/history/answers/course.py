@@ -7,6 +7,7 @@ the value before it is valid until the last sample of any tag that was recorded 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from heapq import merge
 from operator import itemgetter
 from typing import NamedTuple
@@ -35,16 +36,14 @@ class _Part(NamedTuple):
     steps: Callable[[], list[Step]]
 
 
+@dataclass(eq=False)
 class Course:
     """Used by the answering threads."""
 
-    def __init__(
-        self, recent: Recent, reader: Reader, damage: Damage, most: int = MOST_BUCKETS
-    ) -> None:
-        self._recent = recent
-        self._reader = reader
-        self._damage = damage
-        self._most = most
+    _recent: Recent
+    _reader: Reader
+    _damage: Damage
+    _most: int = MOST_BUCKETS
 
     def buckets(
         self, tag: Tag, period: TimeRange, width: int, now: Now, pause: Pause

@@ -1,6 +1,7 @@
 """The newest samples of a tag, found from the end of the history."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from operator import itemgetter
 
 from gateway.contract.past.timerange import TimeRange
@@ -15,13 +16,13 @@ from gateway.tags.sample import has_value
 _ORDER = itemgetter(0, 1)
 
 
+@dataclass(eq=False)
 class Newest:
     """Used by the answering threads."""
 
-    def __init__(self, recent: Recent, reader: Reader, damage: Damage) -> None:
-        self._recent = recent
-        self._reader = reader
-        self._damage = damage
+    _recent: Recent
+    _reader: Reader
+    _damage: Damage
 
     def of(
         self, tag: Tag, period: TimeRange, count: int, pause: Callable[[], None], *, only_good: bool

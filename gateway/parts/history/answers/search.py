@@ -2,6 +2,7 @@
 
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
 
@@ -98,17 +99,15 @@ class Search:
         yield True, place
 
 
+@dataclass(eq=False)
 class StoredRuns:
     """The sorted runs, for one answer."""
 
-    def __init__(
-        self, reader: Reader, damage: Damage, file: Identity | None, period: TimeRange
-    ) -> None:
-        self._reader = reader
-        self._damage = damage
-        self._file = file
-        self.period = period
-        self.damaged: list[SortedRun] = []  # since the last call of `lost`
+    _reader: Reader
+    _damage: Damage
+    _file: Identity | None
+    period: TimeRange
+    damaged: list[SortedRun] = field(default_factory=list)  # since the last call of `lost`
 
     def of(self, runs: Iterable[SortedRun]) -> list[SortedRun]:
         """Returns the runs with samples in the period."""

@@ -2,6 +2,7 @@
 
 import sqlite3
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 from gateway.parts.history.answers.outcomes import Outcomes
 from gateway.parts.history.answers.recent import Recent, Run
@@ -11,23 +12,16 @@ from gateway.parts.history.store.retention import Retention
 BATCH_SIZE = 8192  # samples in one transaction
 
 
+@dataclass(eq=False)
 class Transfer:
     """Stores runs in the order of arrival, and writes the index of each once it is closed."""
 
-    def __init__(
-        self,
-        recent: Recent,
-        outcomes: Sequence[Outcomes],
-        retention: Retention,
-        wall: Callable[[], int],
-    ) -> None:
-        """`wall`: ns since 1970."""
-        self.stored = 0  # samples since the start
-        self._recent = recent
-        self._outcomes = outcomes
-        self._retention = retention
-        self._wall = wall
-        self._unsorted: list[Run] = []  # runs with a number in the file
+    _recent: Recent
+    _outcomes: Sequence[Outcomes]
+    _retention: Retention
+    _wall: Callable[[], int]  # ns since 1970
+    stored: int = 0  # samples since the start
+    _unsorted: list[Run] = field(default_factory=list)  # runs with a number in the file
 
     @property
     def waiting(self) -> int:
