@@ -24,13 +24,13 @@ import zenoh
 from benchmarks.history import tags
 from benchmarks.northbound import Device, Plant
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.contract.interfaces import NoParts
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.session.session_settings import configure
 from gateway.parts.history.answers.recent import MOST_RUNS
 from gateway.parts.history.historian import Historian
 from gateway.service.service import THREAD_SWITCH
 from gateway.tags import good
+from tests.no_parts import NoParts
 from tests.zenoh_peer import free_endpoint
 
 ROOT = Path(__file__).parents[1]

@@ -35,7 +35,6 @@ import structlog
 import zenoh
 
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.contract.interfaces import NoParts
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty
@@ -48,6 +47,7 @@ from gateway.service.service import GC_THRESHOLDS, THREAD_SWITCH
 from gateway.tags import Sample, Tag, WriteResult, WriteRule, good
 from gateway.tags.mirror import Mirror
 from gateway.values import Layout, Value, parse_type
+from tests.no_parts import NoParts
 from tests.zenoh_peer import free_endpoint
 
 SCAN = 100  # samples of one publication

@@ -26,13 +26,13 @@ from benchmarks.start import HERE, Sizes, rows, started
 from gateway.config import Config, load
 from gateway.contract import payload
 from gateway.contract.faults import Documents
-from gateway.contract.interfaces import NoParts
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web.api import Api
 from gateway.parts.web.events import WIRE_EVERY, Events, Loads, Page
 from gateway.plant.part import Core
 from gateway.plant.plant import Plant
 from tests.e2e.processes import free_port
+from tests.no_parts import NoParts
 from tests.sim.virtual import run_virtual
 from tests.web.browser import browser
 from tests.web.serving import PlainNorth

@@ -7,7 +7,7 @@ from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question
 from gateway.contract.payload import Failure, GroupResult
 from gateway.engine.jobs.requests import CommandResult, Peeked
-from gateway.errors import Busy, GatewayError
+from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.tags import Sample, Tag, WriteResult
@@ -171,25 +171,6 @@ class Parts(Protocol):
 
     async def publish_all(self) -> None:
         """Publishes what subscribers of the parts may have missed."""
-
-
-class NoParts:
-    """A gateway without parts."""
-
-    def has_keys(self, part: str) -> bool:
-        return False
-
-    def keyed(self, part: str) -> Keyed:
-        raise Busy(f"there is no {part} here")
-
-    def history(self) -> History | None:
-        return None
-
-    def audit(self, at: int, event: str) -> None:
-        """Keeps nothing."""
-
-    async def publish_all(self) -> None:
-        """Publishes nothing."""
 
 
 class North(Protocol):

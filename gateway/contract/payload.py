@@ -15,21 +15,8 @@ from functools import lru_cache
 
 import orjson
 
+from gateway import errors
 from gateway.engine.jobs.requests import CommandResult, Peeked
-from gateway.errors import (
-    BadValue,
-    Busy,
-    Damaged,
-    GatewayError,
-    LineDown,
-    NotAllowed,
-    NothingToAcknowledge,
-    NotSent,
-    Offline,
-    Refused,
-    Repeated,
-    Unknown,
-)
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.tag import READ
 from gateway.tags.timestamps import rfc3339
@@ -63,16 +50,16 @@ class Problem(StrEnum):
 
 # Of the most special class of an error. All others are unclear.
 _PROBLEMS: Mapping[type, Problem] = {
-    NotSent: Problem.NOT_SENT,
-    BadValue: Problem.BAD_VALUE,
-    Refused: Problem.REFUSED,
-    LineDown: Problem.LINE_DOWN,
-    Busy: Problem.BUSY,
-    Offline: Problem.NO_REPLY,
-    Damaged: Problem.DAMAGED,
-    Unknown: Problem.UNKNOWN_TAG,
-    NotAllowed: Problem.NOT_ALLOWED,
-    NothingToAcknowledge: Problem.NOTHING_TO_ACKNOWLEDGE,
+    errors.NotSent: Problem.NOT_SENT,
+    errors.BadValue: Problem.BAD_VALUE,
+    errors.Refused: Problem.REFUSED,
+    errors.LineDown: Problem.LINE_DOWN,
+    errors.Busy: Problem.BUSY,
+    errors.Offline: Problem.NO_REPLY,
+    errors.Damaged: Problem.DAMAGED,
+    errors.Unknown: Problem.UNKNOWN_TAG,
+    errors.NotAllowed: Problem.NOT_ALLOWED,
+    errors.NothingToAcknowledge: Problem.NOTHING_TO_ACKNOWLEDGE,
 }
 
 
@@ -135,18 +122,18 @@ class WriteOutcome:
     command: bool = False
 
 
-def failure(error: GatewayError) -> Failure:
+def failure(error: errors.GatewayError) -> Failure:
     """Translates an error for the client. An error after which the request may have been done is
     unclear."""
     kinds = type(error).__mro__
     problem = next((_PROBLEMS[kind] for kind in kinds if kind in _PROBLEMS), Problem.UNCLEAR)
-    code = error.code if isinstance(error, Refused) else None
+    code = error.code if isinstance(error, errors.Refused) else None
     return Failure(problem, str(error) or type(error).__name__, code)
 
 
-def audited(error: GatewayError) -> Failure:
+def audited(error: errors.GatewayError) -> Failure:
     """Translates an error for the audit. The repetition itself was not sent."""
-    if isinstance(error, Repeated):
+    if isinstance(error, errors.Repeated):
         return Failure(Problem.NOT_ALLOWED, str(error))
     return failure(error)
 

@@ -5,13 +5,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from gateway.config import Config, LineConfig
-from gateway.contract.interfaces import History, NoParts
+from gateway.contract.interfaces import History
 from gateway.northbound.northbound import Northbound
 from gateway.parts.history.historian import Historian
 from gateway.parts.history.settings import HistorySection
 from gateway.plant.plant import Plant
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample
+from tests.no_parts import NoParts
 from tests.sim.north_judge import Judge
 
 CLOSE_WITHIN = 1.0  # seconds for the history

@@ -6,17 +6,7 @@ Source: Vigor VB/VH manual, B-3-3 and B-3-6: the instruction working status of L
 from enum import StrEnum
 from typing import NamedTuple
 
-from gateway.errors import (
-    BadValue,
-    Busy,
-    GatewayError,
-    LineDown,
-    NoReply,
-    Offline,
-    Refusal,
-    Refused,
-    Superseded,
-)
+from gateway import errors
 from gateway.tags import Reason
 
 
@@ -53,7 +43,7 @@ _OF_SOURCE = {
     Reason.REFUSED: Code.DEVICE_NUMBER,
 }
 # The device says itself that it did nothing, and that the same request may succeed.
-_AGAIN = (Refusal.BUSY, Refusal.DAMAGED)
+_AGAIN = (errors.Refusal.BUSY, errors.Refusal.DAMAGED)
 
 
 class End(StrEnum):
@@ -76,22 +66,22 @@ class Outcome(NamedTuple):
 DONE = Outcome(End.DONE, Code.NORMAL)
 
 
-def outcome_of(error: GatewayError) -> Outcome:
+def outcome_of(error: errors.GatewayError) -> Outcome:
     """Returns the end of a write that failed."""
     why = str(error) or type(error).__name__
     match error:
-        case BadValue() | Superseded():
+        case errors.BadValue() | errors.Superseded():
             return Outcome(End.REFUSED, None, why)
-        case Refused(refusal=refusal) if refusal in _AGAIN:
+        case errors.Refused(refusal=refusal) if refusal in _AGAIN:
             return Outcome(End.NOT_DONE, Code.ABNORMAL, why)
-        case Refused(refusal=refusal):
-            found = refusal is Refusal.ADDRESS
+        case errors.Refused(refusal=refusal):
+            found = refusal is errors.Refusal.ADDRESS
             return Outcome(End.REFUSED, Code.DEVICE_NUMBER if found else Code.ABNORMAL, why)
-        case Offline():
+        case errors.Offline():
             return Outcome(End.NOT_DONE, Code.NO_RESPONSE, why)
-        case Busy() | LineDown():
+        case errors.Busy() | errors.LineDown():
             return Outcome(End.NOT_DONE, Code.ABNORMAL, why)
-        case NoReply():
+        case errors.NoReply():
             return Outcome(End.UNCLEAR, Code.NO_RESPONSE, why)
     return Outcome(End.UNCLEAR, Code.ABNORMAL, why)
 

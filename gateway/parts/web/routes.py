@@ -5,29 +5,12 @@ The server registers the routes, and `openapi` describes them, from the same lis
 
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Protocol
 
 from aiohttp import web
 
 from gateway.parts.web.schemas import TEXT, Schema
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-
-class Parameter(Protocol):
-    """One parameter of an address, after the question mark."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def about(self) -> str: ...
-
-    @property
-    def required(self) -> bool: ...
-
-    @property
-    def schema(self) -> Schema: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +73,7 @@ class Count:
         return found
 
 
+Parameter = Word | Choice | Count
 LIMIT = Count("limit", "Items of this page, 200 if left out", 1, 1000, 200)
 
 
