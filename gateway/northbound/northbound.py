@@ -29,10 +29,10 @@ from gateway.northbound.requests.acceptance import Acceptance, AcceptedUntil
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming
-from gateway.northbound.session import dead_routes, exposures
+from gateway.northbound.session import exposures
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.northbound.session.one_process import only_process
-from gateway.northbound.session.session import CLOSE_WITHIN, open_session
+from gateway.northbound.session.session import CLOSE_WITHIN, forget_dead_routes, open_session
 from gateway.northbound.session.session_settings import configure, drop_limit, endpoints
 from gateway.northbound.session.watchdog import Watchdog
 from gateway.plant.threads import off_loop
@@ -292,7 +292,7 @@ class Northbound:
         while True:
             await lost.wait()
             lost.clear()
-            await dead_routes.forget(self._config)
+            await forget_dead_routes(self._config)
             await asyncio.sleep(_ROUTERS_EVERY)
 
     def _declare_first(

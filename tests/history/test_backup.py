@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import GatewayError
-from gateway.parts.history.files.backup import backup
+from gateway.parts.history.files.offline import backup
 from gateway.parts.history.store.place import trouble
 from tests.history.recorded import SMALL, history, is_intact, numbered, values
 from tests.history_writer import until
@@ -54,7 +54,7 @@ def test_a_copy_is_the_state_of_one_moment_while_samples_are_stored(tmp_path: Pa
 def test_a_copy_replaces_nothing_and_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.parts.history.files.backup.BUSY_WITHIN", 0.0)
+    monkeypatch.setattr("gateway.parts.history.files.offline.BUSY_WITHIN", 0.0)
     file, copy = tmp_path / "h.db", tmp_path / "copy.db"
     with pytest.raises(GatewayError, match="there is no history"):
         backup(file, copy)

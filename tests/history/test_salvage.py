@@ -10,7 +10,7 @@ import pytest
 from gateway.contract.faults import faults
 from gateway.errors import GatewayError
 from gateway.parts.history.files.aside import asides, rename
-from gateway.parts.history.files.salvage import salvage
+from gateway.parts.history.files.offline import salvage
 from gateway.tags import good
 from tests.history.recorded import (
     EVERYTHING,

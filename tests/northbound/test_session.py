@@ -10,8 +10,7 @@ from gateway.config import ZenohConfig, ZenohMode
 from gateway.errors import (
     ConfigError,
 )
-from gateway.northbound.session.dead_routes import visitor
-from gateway.northbound.session.session import open_session
+from gateway.northbound.session.session import open_session, visitor
 from gateway.northbound.session.session_settings import configure
 from gateway.plant.threads import off_loop
 from tests.zenoh_peer import ZenohPeer, free_endpoint

@@ -19,9 +19,9 @@ from gateway.errors import Damaged, GatewayError
 from gateway.parts.history.answers.course import Course
 from gateway.parts.history.answers.search import Search
 from gateway.parts.history.files.aside import asides, rename
-from gateway.parts.history.files.backup import backup as copied
+from gateway.parts.history.files.offline import backup as copied
 from gateway.parts.history.files.offline import offline
-from gateway.parts.history.files.salvage import salvage as salvaged
+from gateway.parts.history.files.offline import salvage as salvaged
 from gateway.parts.history.settings import HistorySection
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.tags.recorded import RecordedQuery

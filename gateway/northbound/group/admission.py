@@ -11,7 +11,7 @@ from gateway.line.send_permit import Duty
 from gateway.northbound.group.claiming import NETWORK_WITHIN, Claiming
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.group.standby import GroupSettings, Standby
-from gateway.northbound.session.second_session import SecondSession
+from gateway.northbound.session.session import SecondSession
 
 
 class Admission:

@@ -17,7 +17,7 @@ from gateway.northbound.group.claim_documents import ClaimDocuments
 from gateway.northbound.group.claims import MOST_OTHERS, Claims
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
-from gateway.northbound.session.second_session import SecondSession
+from gateway.northbound.session.session import SecondSession
 from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -16,7 +16,7 @@ from gateway.line.send_permit import Duty
 from gateway.northbound.group.election import Election, Role, RoleToken, State
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
-from gateway.northbound.session.second_session import SecondSession
+from gateway.northbound.session.session import SecondSession
 from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
