@@ -29,20 +29,16 @@ class Device(Protocol):
         """True: each scan is also published as one `@block`. "only": single values are not."""
 
 
-class Lines(Protocol):
-    """The lines of the plant."""
-
-    def wire_logs(self) -> Mapping[str, WireLog]:
-        """Returns the wire logs by line."""
-
-
-class Plant(Lines, Protocol):
+class Plant(Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""
 
     @property
     def duty(self) -> Duty: ...
 
     def devices(self) -> Iterable[Device]: ...
+
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        """Returns the wire logs by line."""
 
     def begin(self) -> None:
         """Notes that this gateway is active now. Called before the first sample is served."""

@@ -10,7 +10,7 @@ from typing import Any
 import orjson
 import zenoh
 
-from gateway.contract.interfaces import Lines
+from gateway.contract.interfaces import Plant
 from gateway.contract.keys import Keys
 from gateway.line.exchanges import decoded, heard, samples_of
 from gateway.line.wire_log import Event, Learned, Piece
@@ -28,7 +28,7 @@ class Traces:
     """Watches a line from the first subscriber of its trace to the end of the last."""
 
     _keys: Keys
-    _lines: Lines
+    _lines: Plant
     _put: Put
     _tapped: dict[str, "Tap"] = field(default_factory=dict)
 

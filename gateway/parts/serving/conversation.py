@@ -1,39 +1,20 @@
 """One master on one port of a served line: its bytes, and the reply that waits."""
 
 import asyncio
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from gateway.errors import CallEnded, LineDown
-from gateway.stations.served.answering import NOISE, Answerer, Heard
+from gateway.stations.served.answering import NOISE
 from gateway.transport import Port
 
-
-class Answered(Protocol):
-    """The served line of a conversation."""
-
-    unsent: int  # replies that later bytes have followed
-
-    def machine(self) -> Answerer: ...
-
-    def why_not(self, now: float) -> str: ...
-
-    def heard(self, data: bytes) -> None: ...
-
-    def sent(self, data: bytes) -> None: ...
-
-    def take(self, heard: Heard, now: float) -> None: ...
-
-    def ended(self) -> None: ...
-
-    def call_began(self) -> None: ...
-
-    def call_ended(self) -> None: ...
+if TYPE_CHECKING:
+    from gateway.parts.serving.served_line import ServedLine
 
 
 class Conversation:
     """One master on one port: a wire, or one TCP connection."""
 
-    def __init__(self, line: Answered, *, network: bool = False) -> None:
+    def __init__(self, line: "ServedLine", *, network: bool = False) -> None:
         """`network`: one of several connections."""
         self.trouble = ""
         self._line = line

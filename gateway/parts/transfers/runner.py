@@ -2,11 +2,10 @@
 
 import asyncio
 import math
-from collections.abc import Awaitable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
 
 import structlog
 
@@ -15,7 +14,7 @@ from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
 from gateway.parts.transfers.row import Row, State
 from gateway.plant.conditions import Condition, Reading
-from gateway.plant.doors import Doors
+from gateway.plant.plant import Plant
 from gateway.tags import AlarmRule, Level, Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.timestamps import rfc3339
 from gateway.tags.transfer import TransferRule
@@ -27,56 +26,21 @@ FOLDER = "transfers"  # of the status documents
 TRANSFER = "transfer:"  # begins the key of the alarm of a row
 ALARM_DELAY = 3.0  # seconds
 Document = Mapping[str, object]
+# Writes a value as a client does, for a name; after so many seconds nothing is sent any more.
+Write = Callable[[Tag, Value, str, float], Awaitable[WriteResult]]
 
 
-class Plant(Protocol):
-    """The samples of the gateway, and its status."""
-
-    @property
-    def doors(self) -> Doors: ...
-
-    def tag(self, key: str) -> Tag | None: ...
-
-    def target(self, key: str) -> Tag | None:
-        """Finds a tag to be written: also one that is never read."""
-
-    def sample(self, tag: Tag) -> Sample: ...
-
-    def age(self, tag: Tag) -> float:
-        """Returns the seconds since the last read; infinite if there was none."""
-
-    def holds(self, tag: Tag) -> bool:
-        """Returns True for a value that clients write and a master reads."""
-
-    def samples(self, samples: Sequence[Sample]) -> None: ...
-
-    def wall(self) -> int:
-        """Returns ns since 1970."""
-
-
-class Write(Protocol):
-    """Writes as a client does, for `by`. After `within` seconds nothing is sent any more.
-
-    Raises `GatewayError`.
-    """
-
-    def __call__(self, tag: Tag, value: Value, by: str, within: float) -> Awaitable[WriteResult]:
-        """Returns when the device has acknowledged."""
-
-
+@dataclass(slots=True, eq=False)
 class _Running:
     """A row with its tags and its task."""
 
-    __slots__ = ("carried", "row", "rule", "source", "target", "task", "wake")
-
-    def __init__(self, rule: TransferRule, now: float, *, fills: bool) -> None:
-        self.rule = rule
-        self.row = Row(rule, now, fills=fills)
-        self.source: Tag | None = None
-        self.target: Tag | None = None
-        self.carried: WriteResult | None = None  # the last one
-        self.wake = asyncio.Event()
-        self.task: asyncio.Task[None] | None = None
+    rule: TransferRule
+    row: Row
+    source: Tag | None = None
+    target: Tag | None = None
+    carried: WriteResult | None = None  # the last one
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+    task: asyncio.Task[None] | None = None
 
     @property
     def name(self) -> str:
@@ -126,7 +90,7 @@ class Transfers:
 
     def _begin(self, rule: TransferRule, source: Tag, target: Tag) -> None:
         now = asyncio.get_running_loop().time()
-        one = _Running(rule, now, fills=self._plant.holds(target))
+        one = _Running(rule, Row(rule, now, fills=self._plant.holds(target)))
         self._add(one, source, target)
         self._plant.age(source)  # from now on it is known
         self.publish([self._plant.sample(source)])
