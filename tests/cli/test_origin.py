@@ -13,7 +13,7 @@ from gateway.config import Config, load
 from gateway.config.changes import compare
 from gateway.contract import payload
 from gateway.contract.meta import meta_fields
-from gateway.contract.past import bucket_documents
+from gateway.contract.past import buckets
 from gateway.contract.past.buckets import Bucket
 from gateway.contract.payload import WriteOutcome
 from gateway.engine.device.device import Device
@@ -62,7 +62,7 @@ def paths(tag: Tag) -> Mapping[str, Any]:
         "attachment of a raw value": json.loads(payload.attachment(sample)),
         "block": json.loads(payload.block([sample]))[tag.name],
         "description": meta_fields(tag),
-        "bucket": bucket_documents.fields(tag, bucket, ["last"]),
+        "bucket": buckets.fields(tag, bucket, ["last"]),
         "command line": row_of(sample).document,
     }
 

@@ -18,8 +18,8 @@ from gateway.contract.past.question import Question, question
 from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import BadValue, Damaged
 from gateway.parts.history.answers.course import DAMAGED, Course
-from gateway.parts.history.answers.newest import Newest
 from gateway.parts.history.answers.recent import Recent
+from gateway.parts.history.answers.search import Search
 from gateway.parts.history.store.damage import Damage
 from gateway.parts.history.store.file import HistoryFile
 from gateway.parts.history.store.reader import Reader
@@ -199,7 +199,7 @@ def samples(count: int, seed: int) -> list[Sample]:
 
 
 @contextmanager
-def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[Course, Newest]]:
+def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[Course, Search]]:
     """A file with all runs but the last, which is in memory."""
     with closing(HistoryFile(path, 10**8)) as file:
         for run in runs[:-1]:
@@ -210,7 +210,7 @@ def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[Course
         recent.add(runs[-1])
         reader = Reader(path)
         try:
-            yield Course(recent, reader, Damage()), Newest(recent, reader, Damage())
+            yield Course(recent, reader, Damage()), Search(recent, reader, Damage())
         finally:
             reader.renew()
 
@@ -230,7 +230,7 @@ def test_buckets_of_a_file_and_of_memory_are_those_of_a_plain_aggregation(tmp_pa
     steps = steps_of(recorded)
     begin, end = steps[0][0], steps[-1][0]
     runs = [recorded[n : n + 150] for n in range(0, 1500, 150)]
-    with filed(tmp_path / "h.db", runs) as (course, newest):
+    with filed(tmp_path / "h.db", runs) as (course, search):
         for number in range(25):
             first = chance.randint(begin - MINUTE, end)
             last = chance.randint(first, end + MINUTE)
@@ -240,7 +240,7 @@ def test_buckets_of_a_file_and_of_memory_are_those_of_a_plain_aggregation(tmp_pa
             answer = [*course.buckets(SPEED, period, width, Now(now, is_valid=True), nothing)]
             compare(answer, plain([s for s in steps if s[0] <= period.last], width, period, now))
             for count in (1, 100, 2000):
-                last_ones = newest.of(SPEED, period, count, nothing, only_good=False)
+                last_ones = search.newest(SPEED, period, count, nothing, only_good=False)
                 inside = [s for s in steps if period.first <= s[0] <= period.last]
                 shown = [(sample.time, sample.value) for sample in last_ones]
                 assert shown == [(time, value) for time, value, _ in inside[-count:]]
@@ -310,10 +310,10 @@ def test_a_value_is_not_valid_over_samples_that_are_lost(tmp_path: Path) -> None
 
 def test_only_good_newest_samples(tmp_path: Path) -> None:
     runs = [[good(SPEED, n, at(n)), bad(SPEED, Reason.NO_REPLY, at(n + 0.5))] for n in range(4)]
-    with filed(tmp_path / "h.db", runs) as (_, newest):
-        found = newest.of(SPEED, ALWAYS, 3, nothing, only_good=True)
+    with filed(tmp_path / "h.db", runs) as (_, search):
+        found = search.newest(SPEED, ALWAYS, 3, nothing, only_good=True)
         assert [sample.value for sample in found] == [1, 2, 3]
-        both = [*newest.of(SPEED, ALWAYS, 3, nothing, only_good=False)]
+        both = [*search.newest(SPEED, ALWAYS, 3, nothing, only_good=False)]
         assert [sample.value for sample in both] == [None, 3, None]
 
 

@@ -14,7 +14,6 @@ from gateway.contract.past.question import Question
 from gateway.contract.past.timerange import TimeRange, time_range
 from gateway.errors import BadValue, Busy
 from gateway.parts.history.answers.course import Course
-from gateway.parts.history.answers.newest import Newest
 from gateway.parts.history.answers.outcomes import Outcome, Outcomes, Ring
 from gateway.parts.history.answers.recent import Recent
 from gateway.parts.history.answers.search import Search
@@ -53,7 +52,6 @@ class Historian:
         self._reader = Reader(path)
         self._search = Search(self._recent, self._reader)
         self._course = Course(self._recent, self._reader, self._search.damage)
-        self._newest = Newest(self._recent, self._reader, self._search.damage)
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
@@ -143,7 +141,7 @@ class Historian:
         """Yields the newest samples of the range in the order of time. Raises like `samples`."""
         period = self._range(question.time_range, question.last, now)
         count = question.last or HIGHEST_LIMIT
-        found = self._newest.of(tag, period, count, pause, only_good=question.only_good)
+        found = self._search.newest(tag, period, count, pause, only_good=question.only_good)
         return _readable(found)
 
     def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:

@@ -15,12 +15,14 @@ from gateway.parts.history.store.reader import Part, Reader, in_order
 from gateway.parts.history.store.rows import Row, from_row
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
+from gateway.tags.sample import has_value
 from gateway.tags.timestamps import rfc3339
 
 _MANY = 2048  # samples in memory between two pauses
 _LOST = 16  # samples that are lost together
 _FEW_TAGS = 100  # for more, a run is read as a whole
 _TIME = itemgetter(2)
+_ORDER = itemgetter(0, 1)
 
 
 class Search:
@@ -55,6 +57,39 @@ class Search:
         parts += [_part_of(run, period) for run in newest]
         for sample in in_order(parts):
             begun = True
+            yield sample
+        if (lost := stored.lost()) is not None:
+            raise lost
+
+    def newest(
+        self, tag: Tag, period: TimeRange, count: int, pause: Callable[[], None], *, only_good: bool
+    ) -> Iterator[Sample]:
+        """Yields the newest samples of the period, in the order of time. Raises `Damaged` at the
+        end."""
+        file, sorted_runs, newest = self._recent.find(tag.recorded_key)
+        stored = StoredRuns(self._reader, self.damage, file, period)
+        runs = stored.of(sorted_runs)
+        numbers = stored.numbers({tag.recorded_key: tag}, runs)
+        # The order of recording decides between samples of one time.
+        found = [
+            (sample.time, len(runs) + place, sample)
+            for place, run in enumerate(newest)
+            for sample in run
+            if period.first <= sample.time <= period.last and (has_value(sample) or not only_good)
+        ]
+        found = sorted(found, key=_ORDER)[-count:]
+        for place, run in sorted(enumerate(runs), key=lambda run: run[1].last, reverse=True):
+            if len(found) == count and found[0][0] > run.last:
+                break
+            for rows in stored.rows(run, numbers):
+                found += [
+                    (time, place, sample)
+                    for _, _, time, value, kind, bad, _ in rows or ()
+                    if has_value(sample := from_row(tag, time, value, kind, bad)) or not only_good
+                ]
+                pause()
+            found = sorted(found, key=_ORDER)[-count:]
+        for _, _, sample in found:
             yield sample
         if (lost := stored.lost()) is not None:
             raise lost
