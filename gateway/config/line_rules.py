@@ -12,7 +12,14 @@ from gateway.protocols.listening import Listenable
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.stations.registry import can_simulate
 from gateway.transport.modem_events import ModemSettings
-from gateway.transport.port import ModemAddress, SerialSettings, SimulatorAddress, TcpAddress
+from gateway.transport.port import (
+    ModemAddress,
+    SerialPath,
+    SerialSettings,
+    SimulatorAddress,
+    TcpAddress,
+)
+from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
 DIALS_IDLE, ANSWERS_IDLE = 5.0, 60.0  # seconds without an exchange until a call is ended
 _TEXT = 20  # characters, more than the modem's own text NO CARRIER with its line ends
@@ -199,10 +206,26 @@ def modem_of(
     return ModemSettings(**own)
 
 
+def _direction(line: LineSection, path: Path, mistakes: Mistakes) -> Rs485 | None:
+    """Returns how RTS switches the transceiver; None: it is not switched."""
+    own = line.rs485
+    if own is None:
+        return None
+    if not isinstance(line.port, SerialPath):
+        text = "rs485 is a setting of a serial port of this computer: a device server has its own"
+        mistakes.add((*path, "rs485"), text)
+    for name, delay in (("before", own.before), ("after", own.after)):
+        if delay > LONGEST_DELAY or abs(delay * 1e3 - round(delay * 1e3)) > 1e-6:
+            text = "Linux waits whole milliseconds, at most 100ms: write 0ms, 1ms, 2ms"
+            mistakes.add((*path, "rs485", name), text)
+    return Rs485(own.rts == "send", own.before, own.after, hears_itself=bool(line.echo))
+
+
 def line_wire(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> tuple[SerialSettings, WireTiming]:
     """Returns speed and format: those of the file, or the defaults of all protocols of the line."""
+    rs485 = _direction(line, path, mistakes)
     traits = {device.driver.protocol: device.driver.traits for device in devices}
     rates = {name: usual.baudrate for name, usual in traits.items()}
     formats = {name: usual.format for name, usual in traits.items()}
@@ -218,5 +241,6 @@ def line_wire(
                 (*path, setting), f"missing: the devices of this line differ in it ({defaults})"
             )
     baudrate = line.baudrate or next(filter(None, rates.values()), 9600)
-    serial = SerialSettings(baudrate, line.format or next(iter(formats.values()), "8N1"))
+    format_ = line.format or next(iter(formats.values()), "8N1")
+    serial = SerialSettings(baudrate, format_, rs485)
     return serial, WireTiming(serial.baudrate, character_bits(serial.format))

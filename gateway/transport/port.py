@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gateway.errors import ConfigError
+from gateway.transport.rs485 import Rs485
 
 
 class Receiver(Protocol):
@@ -73,6 +74,7 @@ class SerialSettings:
 
     baudrate: int = 9600
     format: str = "8N1"
+    rs485: Rs485 | None = None  # None: the adapter switches by itself, or has wires for each way
 
 
 MODEM = "modem:"

@@ -11,6 +11,7 @@ import serialx
 from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
 from gateway.transport.port import Port, Receiver, SerialPath, SerialSettings
+from gateway.transport.rs485 import set_direction
 from gateway.transport.stream import StreamPort
 
 _SENTENCES = {
@@ -50,6 +51,8 @@ async def open_serial(
                 stopbits=serialx.StopBits(int(stop_bits)),
                 exclusive=True,
             )
+        if settings.rs485 is not None:
+            set_direction(where.path, port.descriptor(), settings.rs485)
         port.ready()
     # ValueError: an invalid path (with a NUL), a format unknown to serialx.
     except (OSError, serialx.SerialException, ValueError, LineDown) as error:

@@ -80,6 +80,12 @@ class StreamPort(asyncio.Protocol):
         """The transport, for the signals of a serial port."""
         return self._transport
 
+    def descriptor(self) -> int:
+        """Returns the file descriptor of an open serial port. Raises `LineDown`."""
+        if self._transport is None or self._loss is not None:
+            raise self._line_down()
+        return int(self._transport.get_extra_info("serial").fileno())
+
     def write(self, data: bytes) -> None:
         transport = self._transport
         if transport is None or transport.is_closing():

@@ -341,13 +341,22 @@ LINES = [
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, echo, serve, request_gap, listen_only, modem, defaults or "
-        "devices",
+        "use port, baudrate, format, echo, rs485, serve, request_gap, listen_only, modem, "
+        "defaults or devices",
     ),
     bad(
         "negative baud rate",
         on_line("port: /dev/ttyS3\nbaudrate: -9600\ndevices: {mixer: {protocol: vigor}}"),
         "4: lines.hall.baudrate: -9600 is no baud rate of serial ports; the nearest is 110",
+    ),
+    bad(
+        "direction of a device server, and a delay that the kernel has not",
+        on_line("port: tcp://10.0.0.7:4001\nrs485: {rts: send, after: 1.5ms}\n"
+                "devices: {mixer: {protocol: vigor}}"),
+        "4: lines.hall.rs485: rs485 is a setting of a serial port of this computer: a device "
+        "server has its own",
+        "4: lines.hall.rs485.after: Linux waits whole milliseconds, at most 100ms: write 0ms, 1ms, "
+        "2ms",
     ),
     bad(
         "port number",

@@ -64,6 +64,17 @@ class DeviceSection(Section):
     """A sheet with more tags of the device, CSV or .xlsx: docs/import.md."""
 
 
+class Rs485Section(Section):
+    """An RS-485 transceiver that RTS switches between sending and receiving: Linux does it."""
+
+    rts: Literal["send", "receive"] = "send"
+    """RTS is on while the port sends, or while it receives."""
+    before: Duration = 0.0
+    """From switching to the first bit; whole milliseconds, at most 100ms."""
+    after: Duration = 0.0
+    """From the last bit to switching back; whole milliseconds, at most 100ms."""
+
+
 class LineSection(Section):
     """One line and the devices on it."""
 
@@ -75,6 +86,8 @@ class LineSection(Section):
     """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
     echo: bool | None = None
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
+    rs485: Rs485Section | None = None
+    """Has Linux switch the RS-485 transceiver of a serial port; left out: it switches by itself."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
     request_gap: Duration | None = None
