@@ -14,6 +14,7 @@ from tests.engine.rig import SILENCE, Rig, bit_device, link_device
 LACKS = Refused("no such function", code="01", unexecuted=True)
 BUSY = Refused("busy", code="06", refusal=Refusal.BUSY, unexecuted=True)
 ADDRESS = Refused("no such address", code="02", refusal=Refusal.ADDRESS)
+FAULT = Refused("it failed in the middle", code="04")
 
 
 def sent(rig: Rig, text: str = "holding:7.3", value: Value = True) -> Write:
@@ -72,7 +73,7 @@ def test_a_device_that_lacks_it_is_tried_again_after_an_hour(rig: Rig) -> None:
     assert sent(rig).masked
 
 
-@pytest.mark.parametrize(("error", "next_one"), [(SILENCE, False), (BUSY, True)])
+@pytest.mark.parametrize(("error", "next_one"), [(SILENCE, False), (BUSY, True), (FAULT, True)])
 def test_one_that_did_not_end_well_is_not_sent_again(
     rig: Rig, error: DeviceError, next_one: bool
 ) -> None:

@@ -117,7 +117,11 @@ class RequestRules:
 
     def _single(self, write: Write, result: Result, now: float, time: int) -> None:
         """Ends a write, or has it sent the other way where the device lacks the first one."""
-        refused = isinstance(result, Refused) and result.refusal is not Refusal.BUSY
+        # Other refusals, such as a fault of the device, do not tell that it changed nothing.
+        refused = isinstance(result, Refused) and (
+            result.refusal is Refusal.ADDRESS
+            or (result.unexecuted and result.refusal is not Refusal.BUSY)
+        )
         outcome = self._written(write, result, None, now, time)
         if write.masked and refused:
             self._schedule.requests.each_alone((write,))
