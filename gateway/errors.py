@@ -15,12 +15,14 @@ GatewayError
 ├── LineDown             reopen the port; pending writes fail at once
 │   └── CallEnded        dial again later: the modem is there, the telephone call is not
 └── DeviceError          one device, one transaction
+    ├── Took             the device limited the written value, and said so
     ├── Refused          the device sent an error reply with its code: report it, do not repeat
     └── Unclear          the device may or may not have done it: repeat reads
         ├── NoReply      silence until the time-out
         └── Garbled      bytes that are no frame or no reply; kept for the log
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
 
 
@@ -116,6 +118,14 @@ class Refused(DeviceError):
         self.code = code
         self.refusal = refusal
         self.unexecuted = unexecuted
+
+
+class Took(DeviceError):
+    """The device acknowledged a write with other units than those sent: these are what it took."""
+
+    def __init__(self, units: Sequence[int]) -> None:
+        super().__init__(f"acknowledged with {units} instead")
+        self.units = units
 
 
 class Unclear(DeviceError):

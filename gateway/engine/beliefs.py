@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from gateway.engine.device.device import ECHO_PROVEN_FOR
-from gateway.engine.device.health import ALIVE_FOR, PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.health import ALIVE_FOR, FORGOTTEN, PROBE_PAUSE, PROBE_SPREAD
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
 from gateway.engine.device.reply_shapes import WARY_FOR
@@ -134,6 +134,13 @@ BELIEFS = (
         "a reply to a probe",
         "it is polled",
         PROBE_PAUSE * (1 + PROBE_SPREAD),
+    ),
+    Belief(
+        "a device that is never read does not answer",
+        "a write without a reply",
+        "a reply to a probe, or a minute without a write",
+        "it is written without a probe",
+        FORGOTTEN + PROBE_PAUSE * (1 + PROBE_SPREAD),
     ),
     Belief(
         "noise destroys its replies",

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from gateway.engine.device.health import State
 from gateway.engine.device.long_writes import LongWrite
+from gateway.engine.device.reply_shapes import QUIET
 from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
@@ -27,6 +28,7 @@ from gateway.engine.jobs.runs import needs_read, own_units, together, verified
 from gateway.errors import (
     Busy,
     Refused,
+    Took,
     Unclear,
 )
 from gateway.line.polling import RESULTS, read_poll
@@ -126,8 +128,13 @@ async def _write(write: Write, talk: Transaction) -> Sent:
         sending = driver.write(talk, tag.span, units)
     else:
         sending = _one_by_one(write, write.long, talk)
-    acknowledged = await _only_reply(sending, write, talk)
-    if not acknowledged or tag.write is None or not tag.write.verify:
+    try:
+        acknowledged = await _only_reply(sending, write, talk)
+    except Took as error:
+        if not verified(tag):
+            return Sent(held=error.units, took=True)
+        acknowledged = True
+    if not acknowledged or not verified(tag):
         return Sent(acknowledged)
     try:
         return Sent(held=await driver.read(talk, tag.span))
@@ -187,16 +194,16 @@ async def _only_reply(
 
     `write`: the first of several; `run`: their addresses.
     """
-    refused: Refused | None = None
+    refused: Refused | Took | None = None
     talk.guarded = write.submitted
     try:
         acknowledged = await sending
-    except Refused as error:
+    except (Refused, Took) as error:
         refused, acknowledged = error, False
     finally:
         talk.guarded = None
     token = write.resyncs.after
-    if token is None and talk.traffic.doubtful:
+    if token is None and (talk.traffic.doubtful or isinstance(refused, Took)):
         token = write.resyncs.spare
     if token is not None:
         await _prove_only_reply(write, run or write.tag.span, token, talk)
@@ -209,25 +216,20 @@ async def _prove_only_reply(write: Write, span: Span, token: int, talk: Transact
     """Sends the resync after a write. Raises `Unclear` if another reply than its own arrived."""
     try:
         await _resync_after(write, span, token, talk)
-        proven = not talk.traffic.extra
-    except Refused as error:
-        _doubt(write)
-        raise Unclear(TWO_REPLIES) from error
-    if not proven:
-        _doubt(write)
+    except Refused:  # its own reply, unless one more follows
+        await talk.settle(2 * QUIET, QUIET)
+    if talk.traffic.extra:
+        if write.long is not None:
+            write.long.doubt()
         raise Unclear(TWO_REPLIES)
-
-
-def _doubt(write: Write) -> None:
-    if write.long is not None:
-        write.long.doubt()
 
 
 async def _resync_after(write: Write, span: Span, token: int, talk: Transaction) -> None:
     """Sends the resync. If the device lacks its addresses, those of the last read follow."""
     device = write.device
     try:
-        await device.driver.resync(talk, span, token, device.probe_spans)
+        near = span if write.tag.polled else None
+        await device.driver.resync(talk, near, token, device.probe_spans)
     except Refused:
         if device.last_read is None:
             raise

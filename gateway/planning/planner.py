@@ -98,7 +98,8 @@ def shortest_round(
 def _by_area(tags: Iterable[Tag], driver: AnyDriver) -> list[tuple[str, list[Tag]]]:
     found: dict[str, list[Tag]] = defaultdict(list)
     for tag in tags:
-        found[tag.span.area].append(tag)
+        if tag.polled:
+            found[tag.span.area].append(tag)
     return [(area, found[area]) for area in sorted(found) if driver.areas[area].readable]
 
 

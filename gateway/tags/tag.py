@@ -37,6 +37,7 @@ class WriteRule:
     verify: bool = False  # read back after the acknowledgement and compare
     repeat: bool = False  # may be sent again after an unclear result
     latest: bool = False  # of several waiting writes only the latest is sent
+    polled: bool = True  # False: it can only be written
 
 
 class CounterRule(NamedTuple):
@@ -141,6 +142,11 @@ class Tag:
             if isinstance(one, kind):
                 return one
         return None
+
+    @property
+    def polled(self) -> bool:
+        """False if it is written, never read."""
+        return self.write is None or self.write.polled
 
     @property
     def label(self) -> Label:

@@ -5,7 +5,7 @@ that it lacks, or for too many, gets the reply that the attack chose: an excepti
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,12 +98,18 @@ class Watch:
 
 @asynccontextmanager
 async def polled(
-    slave: Slave, folder: Path, numbers: Sequence[int], **settings: Any
+    slave: Slave,
+    folder: Path,
+    numbers: Iterable[int] | Mapping[int, Any],
+    *,
+    echo: bool | None = None,
+    **settings: Any,
 ) -> AsyncIterator[tuple[Line, Watch]]:
-    """Runs a line that polls these registers of the slave."""
+    """Runs a line that polls these registers of the slave. `numbers`: also with settings."""
     server = await asyncio.start_server(slave.serve, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    tags = {f"r{n}": {"address": f"holding:{n}", "type": "uint16"} for n in numbers}
+    more = numbers if isinstance(numbers, Mapping) else {n: {} for n in numbers}
+    tags = {f"r{n}": {"address": f"holding:{n}", "type": "uint16", **s} for n, s in more.items()}
     device = {
         "protocol": "modbus-rtu",
         "station": 1,
@@ -113,6 +119,7 @@ async def polled(
         "tags": tags,
     }
     line = {"port": f"tcp://127.0.0.1:{port}", "baudrate": 115200, "devices": {"slave": device}}
+    line |= {} if echo is None else {"echo": echo}
     file = write_config(folder / "config.yaml", "tcp/127.0.0.1:0", {"hall": line})
     [config] = load(file).lines
     watch = Watch()

@@ -700,6 +700,18 @@ TAGS = [
         f"9: {M}.tags.a.write: input:7 is read-only: input cannot be written",
     ),
     bad(
+        "tags that are not polled",
+        on_mixer("protocol: modbus-rtu\nstation: 3\ntags:\n"
+                 "  a: {address: 'holding:7', poll: false}\n"
+                 "  b: {address: 'holding:7', poll: false, write: {verify: true}}\n"
+                 "  c: {address: 'holding:8.3', poll: false, write: true}\n"
+                 "  d: {address: 'holding:9', poll: false, write: true, alarm: {high: 3}}"),
+        f"9: {M}.tags.a.poll: holding:7 is not written either: it needs write: true",
+        f"10: {M}.tags.b.poll: holding:7 cannot be read back: remove verify",
+        f"11: {M}.tags.c.poll: a write of holding:8 reads its word: write the whole word",
+        f"12: {M}.tags.d.alarm: holding:9 can only be written: it can have no alarm",
+    ),
+    bad(
         "reading a broadcast",
         on_mixer("protocol: modbus-rtu\nstation: 0\ntags:\n"
                  "  a: {address: 'holding:7'}\n  b: {address: 'input:7'}\n"

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.beliefs import BELIEFS, Belief, table
-from gateway.engine.device.health import PROBE_SPREAD, State
+from gateway.engine.device.health import FORGOTTEN, PROBE_SPREAD, State
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
@@ -18,7 +18,9 @@ from gateway.engine.results.shorter_silences import ShorterSilences
 from gateway.errors import Evidence, Garbled, NoReply, Refusal, Refused
 from gateway.line.channel import Echo
 from gateway.planning.planner import Block
+from gateway.tags import WriteRule
 from tests.engine.rig import SILENCE, Rig, bit_device, link_device, tcp_device
+from tests.sim.plant import device, make_tag
 
 HOUR = 3600.0
 PAGE = Path(__file__).parents[2] / "docs" / "beliefs.md"
@@ -284,6 +286,24 @@ def offline() -> Way:
     return given_up
 
 
+def never_read() -> Way:
+    tag = make_tag("D10", write=WriteRule(polled=False))
+    health = device([tag]).health
+    assert not health.needs_resync
+    health.unclear(SILENCE, None, HOUR)
+    assert health.needs_resync
+
+    def given_up(after: float) -> bool:
+        health.gave_up(HOUR, 1 + PROBE_SPREAD)
+        while health.needs_resync:  # each probe of it fails too
+            probed = health.next_probe
+            health.unclear(SILENCE, None, probed)
+            health.gave_up(probed, 1 + PROBE_SPREAD)
+        return health.state is State.STARTING and FORGOTTEN <= probed - HOUR <= after
+
+    return given_up
+
+
 def polls_until_online(rig: Rig, job: Any) -> None:
     for _ in range(4):
         if isinstance(job, Probe):
@@ -339,6 +359,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "does not change bits by itself": changes_no_bits,
     "a device is busy": busy,
     "a device is offline": offline,
+    "a device that is never read does not answer": never_read,
     "noise destroys its replies": noise,
     "a device that returns is as quick as before": as_quick_as_before,
     "earlier requests are kept": kept_requests,

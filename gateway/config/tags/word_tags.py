@@ -188,4 +188,4 @@ def _write(
         if own:
             mistakes.add(path, f"{spelt} cannot be written with one request")
         return None
-    return rule_of(setting, kind)
+    return rule_of(setting, kind, polled=settings.poll)

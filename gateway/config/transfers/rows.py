@@ -158,7 +158,8 @@ class _Finder:
             if device is None or device.served is not None:
                 continue
             driver = device.driver
-            if not (_arrives(driver, one) or driver.areas[one.span.area].readable):
+            readable = driver.areas[one.span.area].readable and one.polled
+            if not (_arrives(driver, one) or readable):
                 yield "from", f"{one.key} can only be written, so there is no value to carry"
 
     def read_every(self, tag: Tag) -> float:

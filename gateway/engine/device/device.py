@@ -60,7 +60,9 @@ class Device:
         driver = self.driver
         self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
-        self.health = Health(answerable=self.settings.answerable)
+        answers = self.settings.answerable
+        written = answers and bool(self.tags) and not any(tag.polled for tag in self.tags)
+        self.health = Health(answerable=answers, only_written=written)
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
@@ -99,7 +101,8 @@ class Device:
     @property
     def polled_tags(self) -> list[Tag]:
         """The tags that polls read."""
-        return [tag for tag in self.tags if self.driver.areas[tag.span.area].readable]
+        areas = self.driver.areas
+        return [tag for tag in self.tags if areas[tag.span.area].readable and tag.polled]
 
     @property
     def longest_reply(self) -> float:

@@ -17,6 +17,7 @@ PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block w
 PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
 LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
+FORGOTTEN = 60.0  # seconds after which the reply to a write of a device that is not read is lost
 PROBE_SPREAD = 0.1  # share by which it varies
 MOST_UNANSWERED = 64  # unanswered requests whose times are kept
 
@@ -74,10 +75,12 @@ class Health:
     """The state of one device, and its outstanding requests.
 
     `answerable` is False for a device that is only written to, or only sends unsolicited frames:
-    the line does not probe it.
+    the line does not probe it. `only_written`: it replies, but nothing of it is read. Its first
+    write needs no reply before; after an unclear one a probe, or `FORGOTTEN` seconds of silence.
     """
 
     answerable: bool = True
+    only_written: bool = False
     state: State = State.STARTING
     online: bool = False  # online or failing: its blocks are polled
     consecutive_failures: int = 0
@@ -93,13 +96,14 @@ class Health:
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
     _last_late: float = -math.inf  # a late reply, or one to an older request
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
+    _asked_at: float = -math.inf  # when a request ended unclear last, before it was offline
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
     # A device server may hold requests to its station that this device never sent.
     inherits: bool = False
 
     def __post_init__(self) -> None:
-        self.needs_resync = self.answerable
+        self.needs_resync = self.is_probed
 
     def inherit(self, *, inherits: bool = True) -> None:
         """Notes that a device server may have kept earlier requests to the station, or that it has
@@ -111,11 +115,11 @@ class Health:
         self._move(Event.RESTARTED)
         self.trouble = trouble
         self.consecutive_failures = self.short_probes = 0
-        self.needs_resync = self.answerable
+        self.needs_resync = self.is_probed or (self.only_written and bool(self._unanswered))
 
     def reconnected(self) -> None:
         """Notes a new telephone call to an otherwise unchanged device."""
-        self.needs_resync = self.answerable
+        self.needs_resync = self.is_probed
 
     def answered(self, *, resynced: bool = False) -> bool:
         """Notes a reply. Returns True if the device comes online.
@@ -140,6 +144,8 @@ class Health:
 
         `outstanding`: the requested span. None for a probe: an older span stays outstanding.
         """
+        if self.state is not State.OFFLINE:
+            self._asked_at = now
         self._move(Event.UNCLEAR)
         self.consecutive_failures += 1
         if isinstance(error, Garbled) and error.evidence in OF_THE_WIRE:
@@ -193,6 +199,9 @@ class Health:
             self.pause = PAUSE_ALIVE
         self.next_probe = now + self.pause * spread
         self._last_probe = now
+        if self.only_written and now - self._asked_at >= FORGOTTEN:
+            self._unanswered.clear()
+            self.restart()
 
     def may_be_probed(self, now: float) -> bool:
         """Returns True if its last probe is old enough for one on behalf of a client."""
@@ -224,6 +233,11 @@ class Health:
         self.short_probes = self.short_probes + 1 if short else 0
         if not short:
             self.patient = False
+
+    @property
+    def is_probed(self) -> bool:
+        """True if it is probed before anything else is sent to it."""
+        return self.answerable and not self.only_written
 
     def next_probe_token(self) -> int:
         """Returns a token for a resync. The token after it is free for a second resync request."""

@@ -176,6 +176,8 @@ def span_of(job: Unfinished) -> Span | None:
     match job:
         case Poll():
             return job.span
+        case Write(tag=tag) | WriteTogether(writes=[Write(tag=tag), *_]) if not tag.polled:
+            return None
         case Write(tag=tag):
             return tag.span
         case WriteTogether(writes=[first, *_], run=run) | ReadBack(writes=[first, *_], run=run):
@@ -245,6 +247,7 @@ class Sent:
     acknowledged: bool = True
     held: Sequence[int] | None = None  # of the tag or run, read back; None: without `verify`
     refused_back: DeviceError | None = None  # reading back was refused
+    took: bool = False  # `held` is what the acknowledgement says, not what was read
 
 
 @dataclass(frozen=True, slots=True)

@@ -290,6 +290,8 @@ def _outcome(
         return write.result(now, time, acknowledged=False)
     if sent.refused_back is not None and verified(write.tag):
         return Differs(f"acknowledged, but reading back was refused: {sent.refused_back}")
+    if held is not None and sent.took:
+        return Differs(f"the device took {_differing(write, held)}")
     if held is not None and not write.holds(held):
         return Differs(f"acknowledged, but the device now holds {_differing(write, held)}")
     return write.result(now, time, verified=held is not None)

@@ -63,7 +63,7 @@ class ProbeSchedule:
         starting = [
             device
             for device in others
-            if device.health.state is State.STARTING and not device.broadcast
+            if device.health.state is State.STARTING and device.health.needs_resync
         ]
         if starting:
             if idle or self.failing_lane <= now:

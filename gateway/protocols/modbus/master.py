@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from itertools import count, repeat
 from typing import NamedTuple
 
-from gateway.errors import BadValue, Refused
+from gateway.errors import BadValue, Refused, Took
 from gateway.protocols.driver import EVERY_REQUEST, Area, Cost, Span, Talk, Unit
 from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.modbus import pdu
@@ -184,6 +184,8 @@ class Master:
                 return None
             if heard.pdu in good:
                 return True
+            if request[0] == 6 and heard.pdu[:3] == request[:3] and len(heard.pdu) == 5:
+                raise Took([int.from_bytes(heard.pdu[3:])])
             pdu.raise_refusal(heard.pdu, request[0])
             return None
 

@@ -79,7 +79,9 @@ def _check(own: Any, facts: Facts) -> Iterator[Problem]:
             "alarm",
             f"{facts.name} is never read at station {facts.station}: it can have no alarm",
         )
-    if (field := facts.field) is not None and not (field.polled or field.unsolicited):
+    field, rule = facts.field, facts.write
+    never = field is not None and not (field.polled or field.unsolicited)
+    if never or (rule is not None and not rule.polled):
         yield "alarm", f"{facts.name} can only be written: it can have no alarm"
     if kind.count:
         yield from for_one(own, kind, "alarm")

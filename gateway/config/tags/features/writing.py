@@ -45,6 +45,8 @@ class WriteSettings(Settings):
         Discriminator(_shape),
     ] = False
     """Permission to write the tag, with its rules."""
+    poll: bool = True
+    """False: the tag is written, and never read."""
 
 
 def needs_write(own: Any, facts: Facts) -> Iterator[Problem]:
@@ -67,10 +69,10 @@ def needs_write(own: Any, facts: Facts) -> Iterator[Problem]:
             yield "write", f"{facts.name} cannot be read back, no request reads it: remove verify"
 
 
-def rule_of(setting: bool | WriteSection, kind: ValueType) -> WriteRule:
+def rule_of(setting: bool | WriteSection, kind: ValueType, *, polled: bool = True) -> WriteRule:
     """Returns the rule of `write:` for a tag that can be written."""
     if not isinstance(setting, WriteSection):
-        return WriteRule()
+        return WriteRule(polled=polled)
     number = kind.is_number
     return WriteRule(
         min=setting.min if number else None,
@@ -78,11 +80,19 @@ def rule_of(setting: bool | WriteSection, kind: ValueType) -> WriteRule:
         verify=setting.verify,
         repeat=setting.repeat,
         latest=setting.latest,
+        polled=polled,
     )
 
 
 def _check(own: Any, facts: Facts) -> Iterator[Problem]:
     rule = own.write
+    if not own.poll:
+        if facts.write is None:
+            yield "poll", f"{facts.name} is not written either: it needs write: true"
+        if facts.bit is not None or facts.kind.kind in BYTES:
+            yield "poll", f"a write of {facts.name} reads its word: write the whole word"
+        if isinstance(rule, WriteSection) and rule.verify:
+            yield "poll", f"{facts.name} cannot be read back: remove verify"
     if not isinstance(rule, WriteSection) or rule.min is rule.max is None:
         return
     if facts.write is not None and not facts.kind.is_number:
