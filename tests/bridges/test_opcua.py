@@ -127,7 +127,7 @@ def test_an_opc_ua_client_reads_a_gateway_and_its_history(plant: Plant, tmp_path
     speed, recipe = node("mixer/speed"), node("mixer/recipe")
     plant.gateway.close()
     with started(file) as gateway:
-        until(lambda: plant.status("mixer/recipe") == "Good", "a value is good")
+        until(lambda: plant.status("mixer/recipe") == "GoodEdited", "a value is simulated")
         meta = plant.ask("meta", speed)
         assert (meta["type"], meta["access"], meta["unit"]) == ("Double", 5, "rpm")
         assert plant.ask("meta", recipe)["range"] == [1, 40]
@@ -140,7 +140,7 @@ def test_an_opc_ua_client_reads_a_gateway_and_its_history(plant: Plant, tmp_path
         whole = plant.ask("history", speed, 60, 3)["values"]
         back = plant.ask("history", speed, 60, 3, "back")["values"]
         assert whole[0]["status"] == "BadWaitingForInitialData"
-        assert [known["status"] for known in whole[1:]] == ["Good"] * (len(whole) - 1)
+        assert [known["status"] for known in whole[1:]] == ["GoodEdited"] * (len(whole) - 1)
         times = [known["time"] for known in whole]
         assert sorted(set(times)) == times
         assert back[::-1][: len(whole)] == whole
