@@ -11,8 +11,7 @@ from gateway.cli.terminal import ConfigPath
 from gateway.config import load
 from gateway.contract.past.timerange import LATEST, time_range
 from gateway.errors import GatewayError
-from gateway.parts.audit.chain import checked
-from gateway.parts.audit.file import read
+from gateway.parts.audit.file import checked, read
 from gateway.tags.timestamps import rfc3339
 
 

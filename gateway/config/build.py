@@ -15,7 +15,6 @@ from gateway.config.settings.sections import Place, file_section, placed
 from gateway.config.settings.validate import driver_of, driver_settings, protocols, section, unknown
 from gateway.config.settings.zenoh_records import existing_file, with_files
 from gateway.config.sheets.tags import SheetTags
-from gateway.config.tags.arrays import check_overlaps
 from gateway.config.tags.computed import check_totals, with_computed
 from gateway.config.tags.device_tags import DeviceTags, mapping
 from gateway.config.tags.section import TagDefaults, inherit
@@ -29,6 +28,7 @@ from gateway.config.tags.served import (
     request_gap,
     until_the_next_call,
 )
+from gateway.config.tags.word_tags import check_overlaps
 from gateway.config.transfers.rows import TransferRows
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError

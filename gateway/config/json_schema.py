@@ -8,7 +8,6 @@ from typing import Any, get_type_hints
 
 from pydantic import BaseModel, TypeAdapter
 
-from gateway.config.settings.driver_settings import dataclasses_in, is_duration
 from gateway.config.settings.model import DeviceSection, LineSection
 from gateway.config.settings.parsers import BYTES, SECONDS
 from gateway.config.settings.sections import file_section
@@ -19,6 +18,7 @@ from gateway.config.settings.setting_types import (
     NAME_PATTERN,
     TAG_NAME_PATTERN,
 )
+from gateway.config.settings.validate import dataclasses_in, is_duration
 from gateway.config.tags.section import TagDefaults, TagSection
 from gateway.config.transfers.settings import TransferSection
 from gateway.errors import ConfigError

@@ -17,7 +17,7 @@ from gateway.parts.alarms.board import Alarms, Entry
 from gateway.parts.alarms.file import AlarmFile, parse
 from gateway.parts.alarms.machine import Event, State
 from gateway.parts.alarms.part import AlarmPart
-from gateway.plant.conditions import Condition, Reading
+from gateway.plant.doors import Condition, Reading
 from gateway.plant.plant import Plant
 from gateway.tags import AlarmRule, Deadband, Level, Reason, Tag, bad, good
 from gateway.tags.mirror import Mirror

@@ -7,8 +7,7 @@ from pathlib import Path
 import orjson
 import pytest
 
-from gateway.parts.audit.chain import Event, checked
-from gateway.parts.audit.file import OLDER, AuditFile, read
+from gateway.parts.audit.file import OLDER, AuditFile, Event, checked, read
 
 NOON = 1_795_262_400 * 10**9
 

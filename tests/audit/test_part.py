@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.parts.audit import part
-from gateway.parts.audit.chain import checked
-from gateway.parts.audit.file import read
+from gateway.parts.audit.file import checked, read
 from gateway.parts.audit.part import AuditPart
 from tests.e2e.processes import plc_gateway, started, until, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint

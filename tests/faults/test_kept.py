@@ -7,8 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from gateway.parts.audit.chain import checked
-from gateway.parts.audit.file import read
+from gateway.parts.audit.file import checked, read
 from tests.e2e.processes import started, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 

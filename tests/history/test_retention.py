@@ -12,7 +12,7 @@ from gateway.errors import Busy
 from gateway.parts.history.answers.outcomes import MOST_WAITING
 from gateway.parts.history.answers.recent import MOST_RUNS, SortedRun
 from gateway.parts.history.historian import Historian
-from gateway.parts.history.store.retention import age
+from gateway.parts.history.store.transfer import age
 from gateway.tags import WriteResult, good
 from tests.history.recorded import (
     EVERYTHING,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gateway.cli.line.replay import report, stations_of
 from gateway.config import LineConfig, built, load
-from gateway.parts.recording.recorded import courses, of_units, stations_asked, timed
+from gateway.parts.recording.replay import courses, of_units, stations_asked, timed
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries
 from gateway.plant.build import line_of
 from gateway.protocols.driver import Span

@@ -213,7 +213,7 @@ async def test_a_write_goes_on_when_its_client_leaves(tokens: Path) -> None:
 async def test_a_body_that_does_not_arrive_is_not_waited_for(
     tokens: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.parts.web.replies.BODY_WITHIN", 0.05)
+    monkeypatch.setattr("gateway.parts.web.routes.BODY_WITHIN", 0.05)
     async with serving(tokens_file=tokens) as client:
         address = "/api/write?tag=mixer/recipe"
         answer = await client.ask(address, "POST", b"", Content_Length="9", **AS_JSON)

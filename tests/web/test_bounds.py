@@ -13,7 +13,7 @@ from aiohttp import web
 from gateway.contract.interfaces import History
 from gateway.parts.web.connections import MOST_CONNECTIONS
 from gateway.parts.web.guard import MOST_OF_CLIENT
-from gateway.parts.web.replies import drop
+from gateway.parts.web.routes import drop
 from gateway.tags import Sample
 from tests.history.recorded import SPEED
 from tests.northbound.plant import PlainDevice, PlainPlant
@@ -124,14 +124,14 @@ async def test_clients_that_take_nothing_of_their_answers_close_the_gateway_to_n
 async def test_a_client_that_takes_nothing_of_its_answer_is_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gateway.parts.web.replies.PIECE_WITHIN", 0.2)
+    monkeypatch.setattr("gateway.parts.web.routes.PIECE_WITHIN", 0.2)
     dropped = asyncio.Event()
 
     def dropping(request: web.Request) -> None:
         drop(request)
         dropped.set()
 
-    monkeypatch.setattr("gateway.parts.web.replies.drop", dropping)
+    monkeypatch.setattr("gateway.parts.web.routes.drop", dropping)
     async with serving() as client, asyncio.timeout(300):
         client.north.changed["devices/mixer"] = LONG
         async with connected(client, "/api/devices/mixer", size=4096) as (reader, _):
@@ -142,7 +142,7 @@ async def test_a_client_that_takes_nothing_of_its_answer_is_dropped(
 
 
 async def test_a_slow_client_gets_a_whole_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gateway.parts.web.replies.PIECE_WITHIN", 1.0)
+    monkeypatch.setattr("gateway.parts.web.routes.PIECE_WITHIN", 1.0)
     async with serving() as client:
         client.north.changed["devices/mixer"] = LONG
         async with asyncio.timeout(300), connected(client, "/api/devices/mixer") as (reader, _):

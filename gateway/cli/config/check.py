@@ -14,7 +14,7 @@ from gateway.cli.config.served_plan import served_plan
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
-from gateway.config.file_rules import written
+from gateway.config.loading import written
 from gateway.config.messages import dotted
 from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings

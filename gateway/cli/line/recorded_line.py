@@ -10,7 +10,7 @@ from gateway.config import LineConfig, built, load
 from gateway.config.settings.validate import driver_settings
 from gateway.config.yaml.scalars import scalar
 from gateway.errors import ConfigError, GatewayError
-from gateway.parts.recording.recorded import of_units, stations_asked, timed
+from gateway.parts.recording.replay import of_units, stations_asked, timed
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.listening import Listenable

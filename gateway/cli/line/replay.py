@@ -20,8 +20,7 @@ from gateway.cli.trace import clock
 from gateway.config import LineConfig
 from gateway.errors import ConfigError, GatewayError
 from gateway.line.exchanges import shown
-from gateway.parts.recording.recorded import courses, of_units, timed
-from gateway.parts.recording.replay import Difference, Learned, Replay
+from gateway.parts.recording.replay import Difference, Learned, Replay, courses, of_units, timed
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
 from gateway.protocols.listening import Listenable
 from gateway.simulator.recorded import Answered, Course, OtherStations, RecordedStation

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, replace
 
 from gateway.config.messages import Mistakes, Path, meant
 from gateway.config.settings.records import LineConfig
-from gateway.config.tags.arrays import check_overlaps
 from gateway.config.tags.section import TagDefaults, TagSection, TagSource
-from gateway.config.tags.word_tags import build_tag
+from gateway.config.tags.word_tags import build_tag, check_overlaps
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit

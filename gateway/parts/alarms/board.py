@@ -14,7 +14,7 @@ import structlog
 from gateway.contract import audited
 from gateway.errors import NothingToAcknowledge
 from gateway.parts.alarms.machine import Alarm, Event, State, Status
-from gateway.plant.conditions import Condition, Reading
+from gateway.plant.doors import Condition, Reading
 from gateway.tags import AlarmRule, Quality, Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.values import Value

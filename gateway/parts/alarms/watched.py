@@ -7,7 +7,7 @@ from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.line.line import Line
 from gateway.parts.alarms.settings import AlarmsSection
-from gateway.plant.conditions import Condition, Reading
+from gateway.plant.doors import Condition, Reading
 from gateway.tags import AlarmRule, Level
 
 # Seconds that a line is down before it is an alarm: an adapter that is plugged again, or a device

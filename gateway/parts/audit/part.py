@@ -10,8 +10,7 @@ from pathlib import Path
 import orjson
 import structlog
 
-from gateway.parts.audit.chain import Event
-from gateway.parts.audit.file import AuditFile
+from gateway.parts.audit.file import AuditFile, Event
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.plant.threads import off_loop
 

@@ -18,8 +18,7 @@ from gateway.parts.history.answers.outcomes import Outcome, Outcomes, Ring
 from gateway.parts.history.answers.recent import Recent
 from gateway.parts.history.answers.search import Search
 from gateway.parts.history.store.reader import Reader
-from gateway.parts.history.store.retention import Retention
-from gateway.parts.history.store.transfer import Transfer
+from gateway.parts.history.store.transfer import Retention, Transfer
 from gateway.parts.history.store.writer import Writer
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery

@@ -1,21 +1,31 @@
-"""Replays a wire log: the values that a listen-only line would have learned from these bytes."""
+"""Replays a wire log: the values that a listen-only line would have learned from these bytes.
+
+So a reply that may belong to another request counts for nothing. `of_units` and `courses` find the
+addresses that the requests of a log read, and their values by time.
+"""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from gateway.config import LineConfig
 from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.effects import Effect, Samples
 from gateway.engine.engine import Engine
 from gateway.errors import ConfigError
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
+from gateway.protocols.driver import Address, Span
 from gateway.protocols.listening import Asked, Listenable
-from gateway.tags import Sample
+from gateway.simulator.recorded import Change, Course, Unit, units_asked
+from gateway.tags import Reason, Sample
+from gateway.tags.unit_tag import unit_tag
 from gateway.values import Value
 
 SILENT_BEFORE = 1.0  # seconds; the log begins between two frames
+UNTIMED = 0.05  # seconds from one piece to the next
+_ALWAYS = 1e9  # seconds; no value of a recording is too old
 
 
 class Learned(NamedTuple):
@@ -125,3 +135,81 @@ class Replay:
 
 def _ns(seconds: float) -> int:
     return round(seconds * 1e9)
+
+
+def timed(log: Iterable[LoggedPiece | LoggedValue]) -> Iterator[LoggedPiece]:
+    """Yields the bytes of a log. Those without a time follow each other in 50 ms."""
+    last = 0.0
+    for entry in log:
+        if isinstance(entry, LoggedPiece):
+            last = last + UNTIMED if entry.at is None else entry.at
+            yield entry._replace(at=last)
+
+
+def stations_asked(driver: Listenable, log: Sequence[LoggedPiece], character: float) -> list[int]:
+    """Returns the numbers of the stations that requests of the protocol name."""
+    found, last, ear = set[int](), -math.inf, driver.ear(character)
+    for piece in log:
+        at = _at(piece)
+        silence, last = (at - last if math.isfinite(last) else SILENT_BEFORE), at
+        found |= {one.station for one in ear.feed(piece.data, silence) if isinstance(one, Asked)}
+    return sorted(found)
+
+
+def of_units(line: LineConfig, log: Sequence[LoggedPiece]) -> LineConfig:
+    """Returns the line with a tag for each unit that a request names, instead of its own tags."""
+    requests = [(_at(piece), piece.data) for piece in log if piece.way == ">"]
+    requests = requests or [(_at(piece), piece.data) for piece in log]  # of a listen-only line
+    devices = (_of_units(device, requests) for device in line.devices)
+    return replace(line, devices=tuple(one for one in devices if one.tags))
+
+
+def courses(line: LineConfig, log: Iterable[LoggedPiece]) -> Mapping[str, Course]:
+    """Returns the values of each device by time. `line`: of units.
+
+    Raises `ConfigError` for a protocol whose traffic cannot be learned.
+    """
+    found = {device.name: Course() for device in line.devices}
+    newest: dict[tuple[str, Unit], int] = {}
+    doubtful: dict[tuple[str, Unit], Change] = {}  # until the next reply: it may turn them bad
+
+    def settle() -> None:
+        for (device, unit), change in doubtful.items():
+            if newest.get((device, unit)) != change.value:
+                newest[device, unit] = change.value
+                found[device].changes.append(change)
+        doubtful.clear()
+
+    for event in Replay(line).run(log):
+        if not isinstance(event, Learned):
+            continue
+        samples = [one for one in event.samples if one.reason is not Reason.STARTING]
+        bad = [one for one in samples if one.value is None]
+        for sample in bad:
+            doubtful.pop((sample.tag.device, _unit(sample.tag.span)), None)
+        if len(bad) < len(samples):
+            settle()
+        for sample in samples:
+            if isinstance(sample.value, int):  # a bit or a word
+                unit = _unit(sample.tag.span)
+                change = Change(event.at, unit, int(sample.value))
+                doubtful[sample.tag.device, unit] = change
+    settle()
+    return found
+
+
+def _of_units(device: DeviceSettings, requests: Sequence[tuple[float, bytes]]) -> DeviceSettings:
+    driver, tags = device.driver, []
+    for area, number in units_asked(driver, requests):
+        if area in driver.areas and driver.areas[area].readable:
+            address = Address(area, number)
+            tags.append(unit_tag(device.name, driver, address, driver.spell(address), _ALWAYS))
+    return replace(device, enabled=True, served=None, tags=tuple(tags))
+
+
+def _unit(span: Span) -> Unit:
+    return span.area, span.start
+
+
+def _at(piece: LoggedPiece) -> float:
+    return piece.at or 0.0

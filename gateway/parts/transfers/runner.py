@@ -13,7 +13,7 @@ from gateway.errors import GatewayError
 from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
 from gateway.parts.transfers.row import Row, State
-from gateway.plant.conditions import Condition, Reading
+from gateway.plant.doors import Condition, Reading
 from gateway.plant.plant import Plant
 from gateway.tags import AlarmRule, Level, Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.timestamps import rfc3339

@@ -9,8 +9,7 @@ from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem
 from gateway.errors import BadValue
 from gateway.parts.web.guard import BY
-from gateway.parts.web.replies import answer, body, json_off_loop, raw
-from gateway.parts.web.routes import LIMIT, Choice, Route, Word
+from gateway.parts.web.routes import LIMIT, Choice, Route, Word, answer, body, json_off_loop, raw
 from gateway.parts.web.schemas import ref
 from gateway.plant.part import Core, Listed
 

@@ -25,8 +25,18 @@ from gateway.contract.payload import Problem
 from gateway.errors import BadValue, Busy, GatewayError
 from gateway.parts.web.connections import Places, client_of
 from gateway.parts.web.guard import BY
-from gateway.parts.web.replies import answer, as_json, body, json_off_loop, raw
-from gateway.parts.web.routes import LIMIT, Choice, Count, Route, Word
+from gateway.parts.web.routes import (
+    LIMIT,
+    Choice,
+    Count,
+    Route,
+    Word,
+    answer,
+    as_json,
+    body,
+    json_off_loop,
+    raw,
+)
 from gateway.parts.web.schemas import ref
 from gateway.plant.part import Core
 from gateway.plant.threads import off_loop

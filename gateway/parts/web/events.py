@@ -20,8 +20,7 @@ from gateway.contract import payload
 from gateway.contract.faults import Documents, below, transfers
 from gateway.parts.web.api import Api, overview
 from gateway.parts.web.connections import Places, client_of
-from gateway.parts.web.replies import drop
-from gateway.parts.web.routes import Route, Word
+from gateway.parts.web.routes import Route, Word, drop
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
 from gateway.tags import Quality, Sample, Tag

@@ -16,7 +16,7 @@ from aiohttp.typedefs import Handler, Middleware
 
 from gateway.contract.access.secrets import NamedSecrets
 from gateway.parts.web.connections import Connections, Places, client_of
-from gateway.parts.web.replies import answer, send
+from gateway.parts.web.routes import answer, send
 from gateway.parts.web.settings import WebSection
 
 BY = web.RequestKey("by", str)  # the name of the token; empty without a valid one
