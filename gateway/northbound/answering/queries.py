@@ -7,6 +7,7 @@ answering threads.
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 
 import structlog
@@ -39,32 +40,24 @@ _LONGEST_RANGE = 100  # characters
 _ENDING = Failure(Problem.UNCLEAR, "the gateway is ending")
 
 
+@dataclass(eq=False)
 class Queries:
     """Takes queries on the event loop and finishes each of them."""
 
-    def __init__(
-        self,
-        plant: Plant,
-        index: TagIndex,
-        writes: Writes,
-        commands: Commands,
-        replies: Replies,
-        documents: StatusDocuments,
-        orders: Orders,
-        parts: Parts,
-    ) -> None:
-        self._plant = plant
-        self._index = index
-        self._writes = writes
-        self._commands = commands
-        self._replies = replies
-        self._documents = documents
-        self._orders = orders
-        self._parts = parts
-        busy = partial(replies.outcome, _BUSY)
+    _plant: Plant
+    _index: TagIndex
+    _writes: Writes
+    _commands: Commands
+    _replies: Replies
+    _documents: StatusDocuments
+    _orders: Orders
+    _parts: Parts
+    _tasks: set[asyncio.Task[None]] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        busy = partial(self._replies.outcome, _BUSY)
         # Reads take neither the places nor the threads of writes.
         self._reads, self._requests = AnswerPool(busy), AnswerPool(busy)
-        self._tasks: set[asyncio.Task[None]] = set()
 
     @property
     def counters(self) -> QueryCounters:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 
 import zenoh
@@ -33,6 +34,7 @@ _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without 
 _Row = tuple[str, str]  # the key of a reply, and its document
 
 
+@dataclass(eq=False)
 class Replies:
     """Every method replies to one query and may block while the client does not receive.
 
@@ -40,22 +42,14 @@ class Replies:
     keeps only one of several samples with equal stamps.
     """
 
-    def __init__(
-        self,
-        keys: Keys,
-        plant: Plant,
-        index: TagIndex,
-        stamp: Callable[[], zenoh.Timestamp],
-        parts: Parts,
-    ) -> None:
-        self._keys = keys
-        self._plant = plant
-        self._index = index
-        self._stamp = stamp
-        self._parts = parts
-        self._ended = False
-        self._turns = Turns()
-        self._clock = time.monotonic
+    _keys: Keys
+    _plant: Plant
+    _index: TagIndex
+    _stamp: Callable[[], zenoh.Timestamp]
+    _parts: Parts
+    _ended: bool = False
+    _turns: Turns = field(default_factory=Turns)
+    _clock: Callable[[], float] = time.monotonic
 
     def end(self) -> None:
         """Makes a long answer stop at the next tag."""

@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 from gateway.contract import payload
 from gateway.contract.keys import Keys
@@ -14,28 +15,20 @@ from gateway.northbound.requests.audit import Audit
 _PAUSE = 9.0
 
 
+@dataclass(eq=False)
 class StatusPublisher:
     """Publishes every document, and reports suppressed refusals, every `every` seconds."""
 
-    def __init__(
-        self,
-        keys: Keys,
-        collect: Callable[[], Mapping[str, Mapping[str, object]]],
-        publisher: Publisher,
-        audit: Audit,
-        every: float,
-    ) -> None:
-        """`collect` returns the current documents by path."""
-        self._keys = keys
-        self._collect = collect
-        self._publisher = publisher
-        self._audit = audit
-        self._every = every
-        self._clock = time.monotonic
-        self._collected_at = float("-inf")
-        self._pause_until = float("-inf")
-        self._fields: Mapping[str, Mapping[str, object]] = {}  # by path
-        self._documents: dict[str, bytes] = {}  # by key
+    _keys: Keys
+    _collect: Callable[[], Mapping[str, Mapping[str, object]]]  # the current documents by path
+    _publisher: Publisher
+    _audit: Audit
+    _every: float
+    _clock: Callable[[], float] = time.monotonic
+    _collected_at: float = float("-inf")
+    _pause_until: float = float("-inf")
+    _fields: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # by path
+    _documents: dict[str, bytes] = field(default_factory=dict)  # by key
 
     async def run(self) -> None:
         """Runs until cancelled."""

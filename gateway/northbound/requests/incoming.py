@@ -22,34 +22,27 @@ from gateway.tags import WriteResult
 T = TypeVar("T")
 
 
+@dataclass(eq=False)
 class Incoming:
     """Made once; `start` connects it to the open session. Belongs to the event loop."""
 
-    def __init__(
-        self,
-        keys: Keys,
-        plant: Plant,
-        index: TagIndex,
-        audit: Audit,
-        documents: StatusDocuments,
-        parts: Parts,
-        acceptance: Acceptance,
-    ) -> None:
-        self._keys = keys
-        self._plant = plant
-        self._index = index
-        self._audit = audit
-        self._documents = documents
-        self._parts = parts
-        self._acceptance = acceptance
+    _keys: Keys
+    _plant: Plant
+    _index: TagIndex
+    _audit: Audit
+    _documents: StatusDocuments
+    _parts: Parts
+    _acceptance: Acceptance
+    _queries: Queries | None = None
+    _puts: PutWrites | None = None
+    _declarations: "Declarations | None" = None
+
+    def __post_init__(self) -> None:
         # Of clients that another part of the gateway has admitted: Zenoh and its writers do not.
-        admitted = Acceptance(plant.duty, None)
-        self._admitted = Writes(plant, index, audit, admitted)
-        self.own_writes = OwnWrites(keys, plant, audit)
-        self._admitted_orders = Orders(keys, parts, audit, admitted)
-        self._queries: Queries | None = None
-        self._puts: PutWrites | None = None
-        self._declarations: Declarations | None = None
+        admitted = Acceptance(self._plant.duty, None)
+        self._admitted = Writes(self._plant, self._index, self._audit, admitted)
+        self.own_writes = OwnWrites(self._keys, self._plant, self._audit)
+        self._admitted_orders = Orders(self._keys, self._parts, self._audit, admitted)
 
     def counters(self) -> dict[str, int]:
         """Queries and puts since the start."""

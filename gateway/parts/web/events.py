@@ -10,6 +10,7 @@ import json
 import time
 from collections import ChainMap, deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
@@ -146,25 +147,20 @@ async def _send(
         await asyncio.sleep(WIRE_EVERY)
 
 
+@dataclass(eq=False)
 class Page:
     """The events of one client: notes what it has, and makes what it gets next."""
 
-    def __init__(
-        self,
-        core: Core,
-        events: Events,
-        tags: Sequence[Tag] | None,
-        recorder: Recorder | None,
-    ) -> None:
-        self._core = core
-        self._events = events
-        self._tags = tags
-        self._recorder = recorder
-        self._exchange = 0  # the number of the last one
-        self._load = 0  # the number of the last measurement
-        self._sent: dict[Tag, Sample] = {}
-        self._shown: Mapping[str, Mapping[str, object]] = {}  # by the names `_BY_NAME`
-        self._values_due = self._state_due = 0.0
+    _core: Core
+    _events: Events
+    _tags: Sequence[Tag] | None
+    _recorder: Recorder | None
+    _exchange: int = 0  # the number of the last one
+    _load: int = 0  # the number of the last measurement
+    _sent: dict[Tag, Sample] = field(default_factory=dict)
+    _shown: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # by `_BY_NAME`
+    _values_due: float = 0.0
+    _state_due: float = 0.0
 
     async def next(self) -> bytes:
         """Returns the events that are due; at least the time."""
