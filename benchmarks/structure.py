@@ -2,7 +2,8 @@
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent / "gateway"
@@ -86,6 +87,69 @@ def rooms() -> list[str]:
     return sorted(path.name for path in ROOT.iterdir() if (path / "__init__.py").exists())
 
 
+def imports() -> dict[str, set[str]]:
+    """The modules of gateway/, each with those that it imports, also inside of functions."""
+    known = {module_name(file): tree for file, tree in modules()}
+    found: dict[str, set[str]] = {}
+    for name, tree in known.items():
+        named = set[str]()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                base = node.module or ""
+                each = (f"{base}.{one.name}" for one in node.names)
+                named |= {one if one in known else base for one in each}
+            elif isinstance(node, ast.Import):
+                named |= {one.name for one in node.names}
+        found[name] = {one for one in named if one in known} - {name}
+    return found
+
+
+def module_name(file: str) -> str:
+    return "gateway." + file.removesuffix(".py").removesuffix("__init__").replace("/", ".").rstrip(
+        "."
+    )
+
+
+def arrows() -> dict[str, set[str]]:
+    """The rooms, each with those that its modules import."""
+    found = {room: set[str]() for room in rooms()}
+    for name, named in imports().items():
+        room = name.split(".")[1] if "." in name else ""
+        if room in found:
+            found[room] |= {one.split(".")[1] for one in named if "." in one} & found.keys() - {
+                room
+            }
+    return found
+
+
+def circle(graph: dict[str, set[str]]) -> list[str]:
+    """Returns one circle of imports; empty: there is none."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def fullest(folders: Iterable[Path]) -> tuple[int, str]:
+    """Returns the most files of a folder, and its name."""
+    return max((len(list(one.glob("*.py"))), str(one.relative_to(ROOT.parent))) for one in folders)
+
+
+def crowded(least: int = 40, most: int = 300) -> list[str]:
+    """Modules with more lines than that, or fewer and a single importer."""
+    graph = imports()
+    found = []
+    for path in sorted(ROOT.rglob("*.py")):
+        file, lines = str(path.relative_to(ROOT)), len(path.read_text().splitlines())
+        name = module_name(file)
+        importers = sum(name in named for named in graph.values())
+        small = lines < least and importers == 1 and path.stem not in ("__init__", "__main__")
+        if lines > most or small:
+            found.append(f"{file} {lines}")
+    return found
+
+
 def is_settings(file: str, node: ast.ClassDef) -> bool:
     """Frozen dataclasses and models of the file are settings records."""
     frozen = any("frozen=True" in ast.unparse(decorator) for decorator in node.decorator_list)
@@ -115,7 +179,14 @@ def main() -> None:
     print(f"most arguments of a constructor: {widest[1]} ({widest[2]})")
     print(f"modules that assign state of a device from outside: {assigning}")
     foreign = {room: foreign_assignments(room) for room in rooms()}
-    print(f"rooms: {len(foreign)}; assignments to attributes of other objects: {foreign}")
+    print(f"assignments to attributes of other objects: {foreign}")
+    graph, whole = arrows(), imports()
+    engine = {name: named for name, named in whole.items() if name.startswith("gateway.engine.")}
+    print(f"rooms: {len(graph)}; arrows between them: {sum(map(len, graph.values()))}")
+    print(f"circles between rooms: {circle(graph)}; inside the engine: {circle(engine)}")
+    files, folder = fullest(path for path in ROOT.rglob("*") if (path / "__init__.py").exists())
+    print(f"most files of a folder: {files} ({folder})")
+    print(f"modules over 300 lines, or below 40 with one importer: {crowded()}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from gateway.engine.device.records import CallRecord, CallState
 from gateway.engine.dial_schedule import DialSchedule
 from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast
-from gateway.engine.jobs.jobs import PolledBlock
+from gateway.engine.jobs.poll_entry import PolledBlock
 from gateway.planning.bad_addresses import BadRange
 from gateway.planning.planner import describe
 from gateway.tags.timestamps import rfc3339

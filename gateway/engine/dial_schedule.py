@@ -10,7 +10,7 @@ from gateway.engine.device.health import State
 from gateway.engine.device.records import COMPLETE, CallState
 from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
-from gateway.engine.schedule.poll_entry import PollEntry
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.errors import CallEnded, LineDown
 
 NEVER = float("inf")

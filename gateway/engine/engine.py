@@ -14,18 +14,18 @@ from gateway.engine.device.device import Device
 from gateway.engine.device.records import LineRecord
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.jobs.jobs import (
+    Answer,
     Idle,
     Job,
     Poll,
-    PolledBlock,
     Probe,
     Reopen,
     Result,
+    Sent,
     Traffic,
     Transacted,
-    WriteTogether,
-    resync_around,
 )
+from gateway.engine.jobs.poll_entry import PolledBlock, PollEntry
 from gateway.engine.jobs.requests import Request, Write, why_not_commanded
 from gateway.engine.jobs.unanswered import Unanswered
 from gateway.engine.results.health_rules import HealthRules, offline
@@ -37,7 +37,6 @@ from gateway.engine.results.rule import NEVER, Rules
 from gateway.engine.results.staleness import Staleness
 from gateway.engine.rules import LineState, rules_of
 from gateway.engine.schedule.in_flight import InFlight
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import BadValue, Busy, LineDown, Superseded
 from gateway.planning.wire_timing import WireTiming
@@ -45,6 +44,13 @@ from gateway.tags import Reason, Tag
 
 GAP = 0.02  # seconds without a byte that end a run of noise
 TOO_MANY = "line {line}: too many requests are waiting; not sent"
+
+
+def ends_well(job: Transacted, result: Result) -> bool:
+    """Returns True for a good read, and for a write that is acknowledged and tells nothing new."""
+    if isinstance(job, Write):
+        return isinstance(result, Sent) and result.acknowledged and not job.masked
+    return isinstance(job, Poll) and not isinstance(result, Exception)
 
 
 class Engine:
@@ -65,12 +71,13 @@ class Engine:
         staleness = Staleness(self.schedule, effects)
         health = HealthRules(name, self.schedule, staleness, effects)
         self._polls = PollRules(self.schedule, health, effects)
-        requests = RequestRules(self.schedule, health, effects)
+        self._requests = RequestRules(self.schedule, health, effects)
         gap = max(GAP, 4 * wire.character)
-        self._next_job = NextJob(in_flight, health, self._polls, requests, effects, gap)
+        self._next_job = NextJob(in_flight, health, self._polls, self._requests, effects, gap)
         shared = (self.record, self.schedule, in_flight, staleness, health, effects)
         self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
         self._listens = listens(devices)
+        self._charged: Device | None = None  # its use of the wire grows: by due polls, and probes
         self._replies = 0  # of all stations, until the port was opened
 
     # The cycle of the line
@@ -78,8 +85,9 @@ class Engine:
     def next(self, now: float) -> Job:
         """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
         job = self._next(now)
-        for before in self.rules.before:
-            before(job, now)
+        for rule in self.rules.preparing:
+            if rule.prepares:
+                rule.before(job, now)
         return job
 
     def _next(self, now: float) -> Job:
@@ -94,17 +102,23 @@ class Engine:
         else:
             job = self.schedule.next(now)
         if isinstance(job, PollEntry):
-            return in_flight.begin_poll(job, now)
-        if isinstance(job, Reopen):
-            return job
-        if isinstance(job, Idle):
+            # A poll on demand is not charged: the device must not lose polls because of it.
+            self._charged = None if job.expedited else job.device
+            in_flight.open[job.job] = job
+            job = job.job
+        elif isinstance(job, Idle):
             wakes = [wake(now) for wake in rules.wake] if rules.troubled else ()
             return Idle(min(job.until, *wakes)) if wakes else job
-        if type(job) is Write and (shared := self.schedule.requests.companions(job)):
-            job = WriteTogether(job.device, shared.writes, shared.run)
-        if job.device.shapes is not None:
-            resync_around(job, job.device.shapes, now)
-        in_flight.begin(job, now, job.device if isinstance(job, Probe) else None)
+        elif isinstance(job, Reopen):
+            return job
+        else:
+            self._charged = job.device if isinstance(job, Probe) else None
+            if (shapes := job.device.shapes) is not None:
+                if isinstance(job, Probe):
+                    shapes.probed(job.outstanding, job.token, job.device.probe_spans, now)
+                elif isinstance(job, Answer):
+                    shapes.sent(None, now)
+        in_flight.job, in_flight.begun = job, now
         return job
 
     def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
@@ -114,42 +128,55 @@ class Engine:
         """
         most = min((beside(poll, now) for beside in self.rules.beside), default=0)
         others = self.schedule.alongside(poll.device, most, now)
-        return [self._in_flight.begin_beside(other) for other in others]
+        self._in_flight.open.update((other.job, other) for other in others)
+        return [other.job for other in others]
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
-        device, in_flight = job.device, self._in_flight
-        for concluded in self.rules.after(job, result):
-            concluded(job, result, traffic, now, time)
-        self._count(device, traffic, now)
+        good, in_flight = self._note(job, result, traffic, now, time), self._in_flight
         if isinstance(job, Poll):
             entry = in_flight.open.pop(job)
-            if isinstance(result, Exception):
-                self._next_job.poll_failed(entry, result, now, time)
-            else:  # units are the only good result of a poll
+            if good:  # units are the only good result of a poll
                 self._polls.read(entry, cast("Sequence[int]", result), now, time)
+            else:
+                self._next_job.poll_failed(entry, result, now, time)
             if in_flight.open:
                 return self._effects.take()
             if in_flight.failed:
                 self._next_job.polls_ended(traffic, now, time)
+        elif good and isinstance(job, Write) and isinstance(result, Sent):
+            self._requests.written(job, result, now, time)
         else:
             self._next_job.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:
-            in_flight.ended(now, shared=len(self.devices) > 1)
+            in_flight.job = None
+            in_flight.failed.clear()
+            if self._charged is not None and len(self.devices) > 1:
+                self._charged.used(now, in_flight.begun)
         effects, self._effects.collected = self._effects.collected, []
-        good = isinstance(job, Poll) and not isinstance(result, Exception)
         if not good or len(effects) != 1 or self.deadline <= now:
-            self._set_deadline()  # a good read alone changes none
+            self._set_deadline()  # a good end alone makes it no earlier
         return effects
 
-    def _count(self, device: Device, traffic: Traffic, now: float) -> None:
+    def _note(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> bool:
+        """Passes the result to the rules, and counts it. Returns True if the job ended well."""
+        device, rules, good = job.device, self.rules, ends_well(job, result)
+        if not good or rules.troubled:
+            after = rules.after(device, good=good)
+        else:
+            after = rules.read if isinstance(job, Poll) else ()
+        for concluded in after:
+            concluded(job, result, traffic, now, time)
         characters = (traffic.sent + traffic.heard) * self.wire.character
         self.record.count(characters, traffic.turnaround)
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if device.shapes is not None:
             device.shapes.at = now
+        return good
 
     @property
     def was_answered(self) -> bool:

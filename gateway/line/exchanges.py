@@ -67,7 +67,10 @@ def samples_of(performed: Performed) -> Sequence[Sample]:
     job, result = performed.job, performed.result
     if not isinstance(job, Poll) or isinstance(result, Exception):
         return ()
-    return _samples(job.block, job.own(cast("Sequence[Any]", result)))
+    units, span = cast("Sequence[Any]", result), job.block.span
+    if job.span is not span:  # a longer one was read
+        units = units[span.start - job.span.start :][: span.size]
+    return _samples(job.block, units)
 
 
 def _text(value: Value | None) -> str:

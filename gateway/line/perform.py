@@ -114,16 +114,16 @@ async def _command(job: Command, driver: Any, transaction: Transaction) -> str:
 
 async def _write(write: Write, talk: Transaction) -> Sent:
     """Writes one value, and reads it back if its tag has `verify`. A part changes in its word."""
-    driver, tag = write.device.settings.driver, write.tag
-    units = write.units
+    driver, tag, units = write.device.settings.driver, write.tag, write.units
+    verify = tag.write is not None and tag.write.verify
     if write.resyncs.before is not None:
         await driver.resync(talk, tag.span, write.resyncs.before, write.device.probe_spans)
-    if tag.part is not None and not write.masked:
+    if write.part is not None and not write.masked:
         (word,) = await driver.read(talk, tag.span)
-        units = [tag.part.into(word, write.units[0])]
-    if write.masked and tag.part is not None and isinstance(driver, ChangesBits):
-        bits = tag.part.into(0, write.units[0])
-        sending = driver.change_bits(talk, tag.span, tag.part.bits, bits)
+        units = [write.part.into(word, write.units[0])]
+    if write.masked and write.part is not None and isinstance(driver, ChangesBits):
+        bits = write.part.into(0, write.units[0])
+        sending = driver.change_bits(talk, tag.span, write.part.bits, bits)
     elif write.long is None:
         sending = driver.write(talk, tag.span, units)
     else:
@@ -131,10 +131,10 @@ async def _write(write: Write, talk: Transaction) -> Sent:
     try:
         acknowledged = await _only_reply(sending, write, talk)
     except Took as error:
-        if not verified(tag):
+        if not verify:
             return Sent(held=error.units, took=True)
         acknowledged = True
-    if not acknowledged or not verified(tag):
+    if not acknowledged or not verify:
         return Sent(acknowledged)
     try:
         return Sent(held=await driver.read(talk, tag.span))
@@ -204,7 +204,7 @@ async def _only_reply(
         talk.guarded = None
     token = write.resyncs.after
     if token is None and (talk.traffic.doubtful or isinstance(refused, Took)):
-        token = write.resyncs.spare
+        token = write.device.health.spare_token
     if token is not None:
         await _prove_only_reply(write, run or write.tag.span, token, talk)
     if refused is not None:

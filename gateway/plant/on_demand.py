@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import PolledBlock
+from gateway.engine.jobs.poll_entry import PolledBlock
 from gateway.errors import Busy
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample, Tag

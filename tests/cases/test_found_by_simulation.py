@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gateway.config import load
-from gateway.engine.schedule.poll_entry import PollEntry
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy
 from gateway.plant.plant import Plant as Gateway

@@ -18,6 +18,7 @@ from gateway.contract.past.buckets import Bucket
 from gateway.contract.payload import WriteOutcome
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.requests import Write
+from gateway.engine.results.request_rules import result_of
 from gateway.tags import Reason, Tag, bad, good
 from tests.cli.conftest import Command
 from tests.history.recorded import EVERYTHING, NOON, history
@@ -85,7 +86,7 @@ def test_a_write_to_a_simulated_device_is_not_told_as_a_real_one(tmp_path: Path)
     config = config_of(tmp_path, "simulator")
     tag = tags_of(config)["speed"]
     device = Device(config.devices[0], config.lines[0].wire)
-    result = Write(device, tag, tag.encode(7), 0.0).result(0.1, NOON)
+    result = result_of(Write(device, tag, tag.encode(7), 0.0), 0.1, NOON)
     outcome = WriteOutcome("plant/mixer/speed", 7, result, NOON, 0.1)
     assert json.loads(payload.outcome(result))["origin"] == "simulated"
     assert json.loads(payload.write_outcome(outcome))["origin"] == "simulated"

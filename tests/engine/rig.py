@@ -23,8 +23,8 @@ from gateway.engine.jobs.jobs import (
     Traffic,
     Transacted,
 )
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.jobs.requests import Command, Outcome, Request, Write
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import DeviceError, LineDown, NoReply
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp

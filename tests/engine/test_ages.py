@@ -7,8 +7,8 @@ import pytest
 from gateway.engine.device.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Idle
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.jobs.requests import Write
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.tags import WriteRule
 from tests.sim.plant import device, make_tag

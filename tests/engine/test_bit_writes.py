@@ -84,8 +84,8 @@ def test_one_that_did_not_end_well_is_not_sent_again(
         rig.conclude(write, error)
     assert rig.outcomes[write] is error
     after = Write(rig.device, rig.device.tags[1], [1], rig.now)
-    for before in rig.engine.rules.before:
-        before(after, rig.now)
+    for rule in rig.engine.rules.preparing:
+        rule.before(after, rig.now)
     assert after.masked is next_one
 
 

@@ -103,7 +103,7 @@ def possible(job: Transacted) -> list[Result]:
     """Every result that the job can have, but for the loss of the port."""
     match job:
         case Poll():
-            return [[7] * job.block.span.size, Unsteady("differ"), *FAILED]
+            return [[7] * job.span.size, Unsteady("differ"), *FAILED]
         case Probe():
             return [Resynced(0), Resynced(1), *FAILED]
         case Settle():

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.requests import MOST_WAITING, Group, Write
+from gateway.engine.jobs.request_queue import MOST_WAITING
+from gateway.engine.jobs.requests import Group, Write
 from gateway.errors import Busy, NotSent, Refused, Unclear
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink

@@ -36,7 +36,7 @@ def replied(rig: Rig) -> None:
     rig.conclude(probe, Resynced(1000))
     poll = rig.transacted()
     assert isinstance(poll, Poll)
-    rig.conclude(poll, (0,) * poll.block.span.size)
+    rig.conclude(poll, (0,) * poll.span.size)
 
 
 def test_the_time_until_the_next_opening_doubles_until_a_station_replies() -> None:
@@ -74,7 +74,7 @@ def reopens(rig: Rig, seconds: float = 200.0) -> bool:
             case Probe():
                 rig.conclude(job, Resynced(1))
             case Poll():
-                rig.conclude(job, (0,) * job.block.span.size)
+                rig.conclude(job, (0,) * job.span.size)
     return False
 
 

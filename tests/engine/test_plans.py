@@ -69,8 +69,8 @@ def serve(rig: Rig, until: float, missing: range = range(0), jitter: float = 0.0
                 rig.now = min(until, job.until)
             case Probe():
                 rig.conclude(job, Resynced(9), traffic, 0.002)
-            case Poll(block=block):
-                start, size = block.span.start, block.span.size
+            case Poll(span=span):
+                start, size = span.start, span.size
                 refused = any(n in missing for n in range(start, start + size))
                 rig.conclude(job, ADDRESS if refused else [0] * size, traffic, 0.002)
 

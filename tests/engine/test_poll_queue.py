@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from gateway.engine.device.device import Device
-from gateway.engine.schedule.poll_entry import EXPEDITED, NOT_QUEUED, PollEntry
+from gateway.engine.jobs.poll_entry import EXPEDITED, NOT_QUEUED, PollEntry
 from gateway.engine.schedule.poll_queue import ROOM, PollQueue
 from tests.sim.plant import device, make_tag
 

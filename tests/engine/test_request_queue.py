@@ -1,6 +1,7 @@
 """The waiting requests of a line: peeks wait behind all others, and take none of their places."""
 
-from gateway.engine.jobs.requests import MOST_PEEKS, MOST_WAITING, Command, RequestQueue
+from gateway.engine.jobs.request_queue import MOST_PEEKS, MOST_WAITING, RequestQueue
+from gateway.engine.jobs.requests import Command
 from gateway.protocols.driver import Span
 from tests.sim.plant import device
 

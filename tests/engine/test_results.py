@@ -173,8 +173,8 @@ def serve(
                 rig.conclude(job, Resynced(9))
             case Poll(block=block) if silent(block.span):
                 rig.fail(job, error=error)
-            case Poll(block=block):
-                start, size = block.span.start, block.span.size
+            case Poll(span=span):
+                start, size = span.start, span.size
                 rig.conclude(job, (UNITS * 200)[start : start + size])
 
 
@@ -274,7 +274,7 @@ def test_a_bad_address_is_found_by_halves_and_the_others_are_planned_again() -> 
     rig.now += 400.0
     while rig.device.bad_addresses.bad:
         job = polled(rig)
-        rig.conclude(job, UNITS[: job.block.span.size])
+        rig.conclude(job, UNITS[: job.span.size])
     assert events(rig) == ["address returned"]
     assert len(rig.device.blocks) == 1
 
@@ -417,7 +417,7 @@ def test_a_measured_turnaround_that_changes_the_optimum_plans_again_and_is_logge
     slow = Traffic(sent=17, heard=20, exchanges=1, turnaround=0.06)
     for _ in range(LEARN_EVERY):
         poll = polled(rig)
-        rig.conclude(poll, [7] * poll.block.span.size, slow)
+        rig.conclude(poll, [7] * poll.span.size, slow)
     assert events(rig) == ["plan updated"]
     assert len(rig.device.blocks) < 4
     assert {poll.block for poll in rig.engine.schedule.polls(rig.device)} == set(rig.device.blocks)

@@ -11,8 +11,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
 from gateway.engine.jobs.jobs import Idle, Probe
-from gateway.engine.jobs.requests import MOST_WAITING, WRITE_EXPIRY, Write
-from gateway.engine.schedule.poll_entry import PollEntry
+from gateway.engine.jobs.poll_entry import PollEntry
+from gateway.engine.jobs.request_queue import MOST_WAITING
+from gateway.engine.jobs.requests import WRITE_EXPIRY, Write
 from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
     PATIENT_AFTER,

@@ -311,10 +311,6 @@ class Device:
             pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
         return max(pause, block.every)
 
-    def was_read(self, span: Span) -> None:
-        """Notes a good read: the device has these addresses."""
-        self.last_read = span
-
     @property
     def probe_spans(self) -> Sequence[Span]:
         """Configured addresses for a resync, those of the last good read first.

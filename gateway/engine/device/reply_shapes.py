@@ -107,6 +107,12 @@ class ReplyShapes:
         self._used[shape] = now
         self._sent(shape, now)
 
+    def probed(
+        self, outstanding: Span | None, token: int, spans: Sequence[Span], now: float
+    ) -> None:
+        """Notes a resync that is sent alone."""
+        self.sent(self._driver.resync_shape(outstanding, token, spans), now)
+
     def _sent(self, shape: Hashable, now: float) -> None:
         self._recent.append(shape)
         if now - self.at >= self.quiet:

@@ -3,17 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, cast
 
-from gateway.engine.device.block_reads import BlockReads
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.device.reply_shapes import ReplyShapes
 from gateway.engine.jobs.requests import Command, Request, Write
-from gateway.engine.jobs.runs import needs_read, together
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
-from gateway.protocols.capabilities import UnnumberedReplies
 from gateway.protocols.driver import Span
 
 
@@ -25,28 +20,6 @@ class Poll:
     block: Block
     span: Span  # to be read: that of the block, or a longer one around it
     register: bool = False  # its monitor list must be registered first
-
-    def own(self, units: Sequence[int]) -> Sequence[int]:
-        """Returns the units of the block, of those that were read."""
-        if self.span is self.block.span:
-            return units
-        begin = self.block.span.start - self.span.start
-        return units[begin : begin + self.block.span.size]
-
-
-class PolledBlock(Protocol):
-    """A block in the schedule, as the other rooms see it."""
-
-    @property
-    def block(self) -> Block: ...
-
-    @property
-    def asked(self) -> float:
-        """When it was sent last, by the line's clock."""
-        ...
-
-    @property
-    def reads(self) -> BlockReads: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,34 +160,6 @@ def span_of(job: Unfinished) -> Span | None:
         case Repeat(write=write):
             return write.tag.span
     return None
-
-
-def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
-    """Notes a request that is no poll, and adds the resyncs that it needs."""
-    device, last = job.device, None
-    driver = cast("UnnumberedReplies", device.driver)
-    token = device.health.next_probe_token
-    match job:
-        case Write() | WriteTogether():
-            write = job if isinstance(job, Write) else job.writes[0]
-            span, units, reads = write.tag.span, write.units, write.tag.part is not None
-            if isinstance(job, WriteTogether) and job.run is not None:
-                span, reads = job.run, needs_read(job.writes)
-                units = together(span, job.writes, [0] * span.size)
-            before, after = shapes.written(span, units, reads, now)
-            resyncs = (token() if before else None, token() if after else None)
-            write.resync(*resyncs, device.health.spare_token)
-            if (long := write.long) is not None and not shapes.tells_apart(long, units):
-                long.resync_each([token() for _ in long.spans])
-            return
-        case Command():
-            if not job.broadcast and shapes.may_be_extra(None, now):
-                job.resync(token())
-        case Probe(outstanding=outstanding, token=marked):
-            last = driver.resync_shape(outstanding, marked, device.probe_spans)
-        case Confirm(run=run):
-            last = driver.reply_shape(run)
-    shapes.sent(last, now)
 
 
 # Results

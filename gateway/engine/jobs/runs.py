@@ -5,19 +5,16 @@ are written, and no address between them.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from gateway.engine.device.long_writes import writes_around
+from gateway.engine.jobs.requests import Write
 from gateway.protocols.driver import Span
 from gateway.tags import Tag
-
-if TYPE_CHECKING:
-    from gateway.engine.jobs.requests import Write
 
 _WHOLE = -1  # all bits of an address
 
 
-def run_of(writes: "Sequence[Write]") -> tuple[int, Span]:
+def run_of(writes: Sequence[Write]) -> tuple[int, Span]:
     """Returns how many of the first writes fill one run that one request writes, and the run.
 
     Their order does not count inside a run: the device gets them all at once. A tag with `repeat`
@@ -48,7 +45,7 @@ def run_of(writes: "Sequence[Write]") -> tuple[int, Span]:
     return count, run
 
 
-def _may_share(write: "Write") -> bool:
+def _may_share(write: Write) -> bool:
     tag, rule = write.tag, write.tag.write
     if write.alone or tag.origin.shape is not None or (rule is not None and rule.repeat):
         return False
@@ -60,16 +57,16 @@ def verified(tag: Tag) -> bool:
     return tag.write is not None and tag.write.verify
 
 
-def needs_read(writes: "Sequence[Write]") -> bool:
+def needs_read(writes: Sequence[Write]) -> bool:
     """Returns True if the words of the run are read first, because parts of them are written."""
-    return any(write.tag.part is not None for write in writes)
+    return any(write.part is not None for write in writes)
 
 
-def together(run: Span, writes: "Sequence[Write]", held: Sequence[int]) -> list[int]:
+def together(run: Span, writes: Sequence[Write], held: Sequence[int]) -> list[int]:
     """Returns the units of the run with all writes in it. `held`: as read; zeros without parts."""
     units = list(held)
     for write in writes:
-        at, part = write.tag.span.start - run.start, write.tag.part
+        at, part = write.tag.span.start - run.start, write.part
         if part is None:
             units[at : at + write.tag.span.size] = write.units
         else:
@@ -77,7 +74,7 @@ def together(run: Span, writes: "Sequence[Write]", held: Sequence[int]) -> list[
     return units
 
 
-def own_units(write: "Write", run: Span, held: Sequence[int]) -> Sequence[int]:
+def own_units(write: Write, run: Span, held: Sequence[int]) -> Sequence[int]:
     """Returns the units of the write's tag, of those of its run."""
     at = write.tag.span.start - run.start
     return held[at : at + write.tag.span.size]

@@ -20,12 +20,12 @@ from gateway.engine.jobs.jobs import (
     WriteTogether,
     span_of,
 )
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.request_rules import RequestRules
 from gateway.engine.schedule.in_flight import InFlight
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import (
     BadValue,
     DeviceError,
@@ -71,7 +71,7 @@ class NextJob:
         """Notes that a device server may have kept requests of an earlier process."""
         self.inherits = True
 
-    def poll_failed(self, poll: PollEntry, result: Exception, now: float, time: int) -> None:
+    def poll_failed(self, poll: PollEntry, result: Result, now: float, time: int) -> None:
         """Applies the result of a poll without units."""
         device, results = poll.device, self._results
         match result:
@@ -85,7 +85,7 @@ class NextJob:
                 self._in_flight.failed.append((poll, result))
             case LineDown():
                 device.health.left_outstanding(poll.job.span, now)
-            case _:
+            case Exception():
                 raise result
 
     def polls_ended(self, traffic: Traffic, now: float, time: int) -> None:

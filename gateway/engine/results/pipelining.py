@@ -54,6 +54,7 @@ class Pipelining(Rule):
         self._in_flight = in_flight
         self._effects = effects
         self._failed: list[Poll] = []  # of the present transaction
+        self._ended_polls = 0  # of it
         self._windows: dict[Device, _Window] = {}
 
     def applies(self, devices: Sequence[Device]) -> bool:
@@ -61,6 +62,7 @@ class Pipelining(Rule):
 
     def opened(self, now: float) -> None:
         self._failed.clear()
+        self._ended_polls = 0
 
     def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         for device in changes.left:
@@ -83,11 +85,13 @@ class Pipelining(Rule):
         """Takes the results of the polls of a transaction, until the last one has ended."""
         if not isinstance(job, Poll) or job.device.window == 1:
             return
+        self._ended_polls += 1
         if isinstance(result, Unclear) and not isinstance(result, Unsteady):
             self._failed.append(job)
         if len(self._in_flight.open) == 1:
             failed, self._failed = self._failed, []
-            self._ended(job, self._in_flight.together, failed, now)
+            count, self._ended_polls = self._ended_polls, 0
+            self._ended(job, count, failed, now)
 
     def _ended(self, poll: Poll, count: int, failed: Sequence[Poll], now: float) -> None:
         """Takes the end of a transaction with `count` polls, of which `poll` was the last."""

@@ -8,8 +8,8 @@ from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.monitor_list import REFUSED_FOR
 from gateway.engine.effects import Effects, Samples
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.results.health_rules import HealthRules
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.replan_budget import ReplanBudget
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import (
@@ -50,16 +50,15 @@ class PollRules:
         health = device.health
         if health.needs_resync or health.state is not State.ONLINE:
             self._results.answered(device, now, time)
-        if poll.job.span is not block.span:
-            units = poll.job.own(units)
-            if device.shapes is not None and device.shapes.longer.failed:
-                device.shapes.longer.answered(block.span)
+        shapes = device.shapes
+        if shapes is not None and shapes.longer.failed and poll.job.span is not block.span:
+            shapes.longer.answered(block.span)
         if not block.listed:
-            device.was_read(block.span)
-        self._effects.collected.append(Samples(poll.reads.take(block, units, now, time)))
+            device.last_read = block.span  # the device has these addresses
+        samples = self._schedule.read(poll, units, now, time)
+        self._effects.collected.append(Samples(samples))
         if block.of_fields:
             self._count_garbled(device, units)
-        self._schedule.polled(poll, now)
         if not device.bad_addresses.clear:
             self._read_beside_bad(device, block, now)
         replans = self._replans

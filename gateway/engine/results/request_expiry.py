@@ -1,7 +1,8 @@
 """Request expiry: ends requests that waited too long for the line."""
 
 from gateway.engine.effects import Effects
-from gateway.engine.jobs.requests import RequestQueue, Write
+from gateway.engine.jobs.request_queue import RequestQueue
+from gateway.engine.jobs.requests import Write
 from gateway.engine.results.rule import NEVER, Rule
 from gateway.errors import Busy
 

@@ -20,13 +20,22 @@ from gateway.engine.jobs.jobs import (
     requests_of,
     span_of,
 )
-from gateway.engine.jobs.requests import Command, Group, Outcome, Request, Write, after_failed
+from gateway.engine.jobs.poll_entry import PollEntry
+from gateway.engine.jobs.requests import (
+    RACE,
+    Command,
+    Group,
+    Outcome,
+    Request,
+    Write,
+    after_failed,
+)
 from gateway.engine.jobs.runs import own_units, verified
 from gateway.engine.results.health_rules import HealthRules
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy, DeviceError, GatewayError, LineDown, Refusal, Refused, Unclear
 from gateway.protocols.driver import Span
+from gateway.tags import WriteResult
 
 BROADCAST_PAUSE = 0.1  # seconds
 _SHOWN = 3  # elements of an array that differ
@@ -72,6 +81,10 @@ class RequestRules:
             case Repeat(write=write, error=error):
                 self._end(write, self._written(write, result, error, now, time), now)
         return None
+
+    def written(self, write: Write, sent: Sent, now: float, time: int) -> None:
+        """Applies the result of a write that was sent."""
+        self._end(write, self._written(write, sent, None, now, time), now)
 
     def settled(self, settle: Settle, now: float) -> Confirm | None:
         """Ends the request after an unclear end, or returns the step that the tag allows."""
@@ -136,11 +149,11 @@ class RequestRules:
         match result:
             case Sent(acknowledged=False):
                 self._pause(device)
-                return write.result(now, time, acknowledged=False)
+                return result_of(write, now, time, acknowledged=False)
             case Sent():
                 self._acknowledged(device, now, time)
                 if result.held is None and result.refused_back is None:
-                    return write.result(now, time)
+                    return result_of(write, now, time)
                 return _outcome(write, result, result.held, now, time)
             case Refused():
                 self._refused(device, result, now, time)
@@ -196,7 +209,7 @@ class RequestRules:
             elif held is not None:
                 self._results.answered(job.device, now, time)
                 if write.holds(held):
-                    outcome = write.result(now, time, verified=True)
+                    outcome = result_of(write, now, time, verified=True)
             self._end(write, outcome, now)
 
     def _confirmed(self, job: Confirm, result: Result, now: float, time: int) -> Repeat | None:
@@ -221,7 +234,7 @@ class RequestRules:
             if rule is not None and rule.repeat and now < write.expires:
                 return Repeat(job.device, write, job.error)
         for write in job.writes:
-            verdict = write.result(now, time, verified=True) if write in done else job.error
+            verdict = result_of(write, now, time, verified=True) if write in done else job.error
             self._end(write, verdict, now)
         return None
 
@@ -282,19 +295,27 @@ class RequestRules:
         )
 
 
+def result_of(
+    write: Write, now: float, time: int, *, verified: bool = False, acknowledged: bool = True
+) -> WriteResult:
+    """Returns the result. `now` by the line's clock, `time` in ns since 1970."""
+    took, note = now - write.submitted, RACE if write.races else ""
+    return WriteResult(write.value, time, took, verified, acknowledged, note, write.origin)
+
+
 def _outcome(
     write: Write, sent: Sent, held: Sequence[int] | None, now: float, time: int
 ) -> Outcome:
     """Returns the outcome of a write that was sent. `held`: its units, read back."""
     if not sent.acknowledged:
-        return write.result(now, time, acknowledged=False)
+        return result_of(write, now, time, acknowledged=False)
     if sent.refused_back is not None and verified(write.tag):
         return Differs(f"acknowledged, but reading back was refused: {sent.refused_back}")
     if held is not None and sent.took:
         return Differs(f"the device took {_differing(write, held)}")
     if held is not None and not write.holds(held):
         return Differs(f"acknowledged, but the device now holds {_differing(write, held)}")
-    return write.result(now, time, verified=held is not None)
+    return result_of(write, now, time, verified=held is not None)
 
 
 def _differing(write: Write, held: Sequence[int]) -> str:

@@ -16,8 +16,11 @@ class Rule(Protocol):
     `now` is the line's clock in seconds, `time` is in nanoseconds since 1970.
     """
 
-    # False: it has nothing to say while the last job of each device was a good read.
+    # False: it has nothing to say while the last job of each device ended well.
     always: bool = True
+
+    # False: `before` has nothing to do at present.
+    prepares: bool = True
 
     # May this be sent now, or when?
 
@@ -100,7 +103,7 @@ class Rules:
     def __init__(self, rules: Iterable[Rule], devices: Sequence[Device]) -> None:
         self.all = tuple(rules)
         self._devices = devices
-        self.troubled: set[Device] = set()  # whose last job was no good read
+        self.troubled: set[Device] = set()  # whose last job did not end well
         self.select()
 
     def select(self) -> None:
@@ -110,7 +113,7 @@ class Rules:
         self.wake = [rule.wake for rule in using if _has(rule, Rule.wake)]
         self.free = [rule.free for rule in using if _has(rule, Rule.free)]
         self.beside = [rule.beside for rule in using if _has(rule, Rule.beside)]
-        self.before = [rule.before for rule in using if _has(rule, Rule.before)]
+        self.preparing = [rule for rule in using if _has(rule, Rule.before)]
         self.concluded = [rule.concluded for rule in using if _has(rule, Rule.concluded)]
         always = [rule for rule in using if rule.always]
         self.asked_always = any(_has(rule, Rule.free) or _has(rule, Rule.first) for rule in always)
@@ -119,15 +122,9 @@ class Rules:
         self.unmatched = [rule.unmatched for rule in using if _has(rule, Rule.unmatched)]
         self.timed = [rule for rule in using if type(rule).due is not Rule.due]
 
-    def after(self, job: Transacted, result: Result) -> Sequence[_Concluded]:
-        """Returns the rules that take this result. A good read after good reads is for few."""
-        troubled = self.troubled
-        if not isinstance(job, Poll) or isinstance(result, Exception):
-            troubled.add(job.device)
-        elif not troubled:
-            return self.read
-        else:
-            troubled.discard(job.device)
+    def after(self, device: Device, *, good: bool) -> Sequence[_Concluded]:
+        """Returns the rules that take a result of the device, unless all have been good."""
+        (self.troubled.discard if good else self.troubled.add)(device)
         return self.concluded
 
     def preceding(self, now: float) -> Answer | Idle | Reopen | None:

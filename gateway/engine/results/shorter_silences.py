@@ -10,10 +10,10 @@ from gateway.engine.device.health import State
 from gateway.engine.device.station_silence import MOST_DOUBLED
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import Idle, Job, Poll, Reopen, Result, Traffic, Transacted
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.results.rule import Rule
 from gateway.engine.results.unsolicited import speaks
 from gateway.engine.schedule.in_flight import InFlight
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import Garbled, NoReply, Refusal, Refused
 
 PROOF = 50  # replies for each station at one step, without a loss, before the next step
@@ -54,6 +54,7 @@ class ShorterSilences(Rule):
         self._devices = devices
         self._learning = _learning(devices)
         self.pace = Pace()
+        self.prepares = False
         self.step = 0  # so many times the safe silences are halved
         self.answered = 0  # polls at this step, after its silence
         self.look_at = float(PROOF) if self._learning else math.inf
@@ -72,6 +73,7 @@ class ShorterSilences(Rule):
         """Sets the silence before the requests of the job."""
         if self.suspects:
             self.judge(now)
+        self.prepares = bool(self.step or self.suspects)
         if not self.step or isinstance(job, Idle | Reopen):
             return
         entry = self._in_flight.open.get(job) if isinstance(job, Poll) else None
@@ -79,6 +81,7 @@ class ShorterSilences(Rule):
         silence = device.silence
         silence.keep_safe(at_rest=False)
         if entry is None:
+            self.spoke = None
             return
         shape = None if device.shapes is None else device.shapes.last
         copied = spoke is device and self._shape in (None, shape)
@@ -117,6 +120,7 @@ class ShorterSilences(Rule):
         if sum(device.load for device in self._devices) < self.pace.needed:
             return
         self.step += 1
+        self.prepares = True
         self.spoke = None
         for device in self._devices:
             device.silence.take_step(self.step, now)
@@ -149,7 +153,7 @@ class ShorterSilences(Rule):
         self.answered = 0
         if self.step and silence < device.silence.safe:
             near = (device,) if self.spoke in (None, device) else (device, self.spoke)
-            self.suspects = near, silence
+            self.suspects, self.prepares = (near, silence), True
             self._restore(str(result), now)
 
     def judge(self, now: float) -> None:

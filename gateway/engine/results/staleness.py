@@ -7,8 +7,8 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.results.rule import NEVER, Rule
-from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.planning.planner import describe
 from gateway.tags import Reason

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.engine.device.device import Device
-from gateway.engine.schedule.poll_entry import EXPEDITED, NOT_QUEUED, ON_DEMAND, PollEntry
+from gateway.engine.jobs.poll_entry import EXPEDITED, NOT_QUEUED, ON_DEMAND, PollEntry
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
 OVERTAKEN, LOOKED_AT = 0.5, 32  # seconds, and the first entries of a heap: about the next polls
@@ -23,6 +23,10 @@ class DuePolls:
     heap: Heap = field(default_factory=list)
     place: int = NO_PLACE  # the ticket of the device's one valid entry in `PollQueue.in_time`
     most: int = ROOM
+
+    def move(self, place: int) -> None:
+        """Notes its one valid place among the devices."""
+        self.place = place
 
     def first(self) -> PollEntry | None:
         """Returns the poll with the earliest deadline, after it has dropped stale entries."""
@@ -97,7 +101,7 @@ class PollQueue:
         elif not on_demand and poll.ticket != EXPEDITED:
             if poll.ticket == ON_DEMAND:
                 self.expedited.remove(poll)
-            poll.queue(EXPEDITED)
+            poll.ticket = EXPEDITED
             self.expedited.appendleft(poll)
 
     def first_to_differ(self, first: PollEntry, now: float) -> PollEntry:
@@ -225,7 +229,7 @@ class PollQueue:
             elif first.ticket != ticket:
                 self._place(own)
             else:
-                own.place = LATE
+                own.move(LATE)
                 heapq.heappush(self._late, (own.device.use, ticket, own))
         return None
 
@@ -237,7 +241,7 @@ class PollQueue:
             first = own.first()
             if first is None or own.heap[0][0] >= now:
                 heapq.heappop(late)
-                own.place = NO_PLACE
+                own.move(NO_PLACE)
                 if first is not None:
                     self._place(own)
             elif use < own.device.use:  # it has used the wire since

@@ -3,18 +3,18 @@
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from gateway.engine.device.block_reads import BlockReads
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.jobs.jobs import Idle, Probe
-from gateway.engine.jobs.requests import Request, RequestQueue
+from gateway.engine.jobs.jobs import Idle, Probe, WriteTogether
+from gateway.engine.jobs.poll_entry import EXPEDITED, ON_DEMAND, BlockReads, PollEntry
+from gateway.engine.jobs.request_queue import RequestQueue
+from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.jobs.unanswered import Unanswered
-from gateway.engine.schedule.poll_entry import EXPEDITED, ON_DEMAND, PollEntry
 from gateway.engine.schedule.poll_queue import PollQueue
 from gateway.engine.schedule.probe_schedule import ProbeSchedule
 from gateway.planning.planner import Block
-from gateway.tags import Tag
+from gateway.tags import Sample, Tag
 
 NEVER = float("inf")
 UNCHANGED: Mapping[Tag, Tag] = {}
@@ -200,7 +200,7 @@ class Schedule:
 
     def next(
         self, now: float, free: Callable[[Device, float], float] | None = None
-    ) -> Request | Probe | PollEntry | Idle:
+    ) -> Write | WriteTogether | Command | Probe | PollEntry | Idle:
         """Returns the next job. `free`: when a device may be polled; None: all may be at once."""
         if now >= self._on_demand_at or self._queue.expedited:
             self._share_on_demand(now)
@@ -244,13 +244,15 @@ class Schedule:
         if now < self._on_demand_lane and self._queue.expedited:
             self._queue.return_due(now)
 
-    def _next_request(self, now: float, due: bool) -> Request | Probe | None:
+    def _next_request(
+        self, now: float, due: bool
+    ) -> Write | WriteTogether | Command | Probe | None:
         first = self.requests.first.device
         if first.health.needs_resync:
             probe = self._probes.for_request(first, now, due=due)
             if probe is not None:
                 return probe
-        request = self.requests.take()
+        request = self.requests.take(now)
         if request is not None:
             self._wrote = True
             return request
@@ -298,9 +300,19 @@ class Schedule:
 
     # Results
 
-    def polled(self, poll: PollEntry, now: float, *, answered: bool = True) -> None:
-        """Ends the poll for this period, after a good or a bad read."""
+    def read(
+        self, poll: PollEntry, units: Sequence[int], now: float, time: int
+    ) -> Sequence[Sample]:
+        """Ends the poll for this period, after a good read. Returns its samples."""
         # One telephone call reads all that is due at a time.
+        samples = poll.read(units, now, time, None if self.reaches_by_modem else self._phases)
+        if poll.block.every > LONG:
+            self._hasten(poll, now)
+        self._queue.push(poll)
+        return samples
+
+    def polled(self, poll: PollEntry, now: float, *, answered: bool = True) -> None:
+        """Ends the poll for this period, after a reply without values, or none."""
         poll.ended(now, answered, None if self.reaches_by_modem else self._phases)
         if poll.block.every > LONG:
             self._hasten(poll, now)

@@ -1,17 +1,85 @@
 """The entry of one block in the schedule: when it is read, and how far its polls came."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
-from gateway.engine.device.block_reads import BlockReads
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST
 from gateway.engine.jobs.jobs import Poll
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span
+from gateway.tags import Sample
+from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
+
+
+@dataclass(slots=True)
+class BlockReads:
+    """The last good read of a block, and counts. Times in seconds of the line's clock."""
+
+    at: float | None = None  # the last one; None: the block's values are bad
+    ever: bool = False  # the block was read at least once
+    scan: Scan | None = None  # the next read is compared with it; None: with nothing
+    count: int = 0  # good ones since it was planned
+    overruns: int = 0  # rounds that were skipped because the one before was late
+    mean_gap: float = 0.0  # between two good reads, smoothed over about ten
+    worst_gap: float = 0.0
+
+    def take(self, block: Block, units: Sequence[int], now: float, time: int) -> Sequence[Sample]:
+        """Returns the samples of a good read. Only units that changed are decoded."""
+        if self.at is not None:
+            gap = now - self.at
+            if gap > self.worst_gap:
+                self.worst_gap = gap
+            self.mean_gap += (gap - self.mean_gap) / (min(10, self.count) or 1)
+        self.count += 1
+        self.at, self.ever = now, True
+        if block.of_fields:
+            return block.decoder.fields(units, time)
+        scan = self.scan
+        if scan is None or scan.latest.superseded:
+            scan = self.scan = block.decoder.first(units, time)
+        elif units == scan.units:
+            scan.time = time
+        else:
+            scan = self.scan = block.decoder.after(scan, units, time)
+        return scan
+
+    def forget(self, now: float) -> float:
+        """Forgets the last read, because its values turn bad. Returns their age."""
+        age = 0.0 if self.at is None else now - self.at
+        self.worst_gap = max(self.worst_gap, age)
+        self.at = self.scan = None
+        return age
+
+    def restart(self) -> None:
+        """Forgets when the last read was: the device comes online with other values."""
+        self.at = None
+
+    def compare_with_nothing(self) -> None:
+        """Has all units of the next read decoded."""
+        self.scan = None
+
+    def count_overruns(self, missed: int) -> None:
+        self.overruns += missed
+
+
+class PolledBlock(Protocol):
+    """A block in the schedule, as the other rooms see it."""
+
+    @property
+    def block(self) -> Block: ...
+
+    @property
+    def asked(self) -> float:
+        """When it was sent last, by the line's clock."""
+        ...
+
+    @property
+    def reads(self) -> BlockReads: ...
 
 
 @dataclass(slots=True, eq=False)
@@ -93,16 +161,25 @@ class PollEntry:
             if register is not job.register:
                 self.job = Poll(device, block, span, register)
         elif span is not job.span:
-            self.job = self._job(span)
+            longer = self._longer.get(span)
+            if longer is None:
+                longer = self._longer[span] = Poll(device, block, span)
+            self.job = longer
         return self
 
-    def _job(self, span: Span) -> Poll:
-        found = self._longer.get(span)
-        if found is None:
-            found = self._longer[span] = Poll(self.device, self.block, span)
-        return found
-
     # Its results
+
+    def read(
+        self, units: Sequence[int], now: float, time: int, phases: Iterator[float] | None
+    ) -> Sequence[Sample]:
+        """Ends a good read of `job`, and returns its samples. `phases`: as in `ended`."""
+        span, read = self.block.span, self.job.span
+        if read is not span:
+            begin = span.start - read.start
+            units = units[begin : begin + span.size]
+        samples = self.reads.take(self.block, units, now, time)
+        self.ended(now, True, phases)
+        return samples
 
     def ended(self, now: float, answered: bool, phases: Iterator[float] | None) -> None:
         """Makes it due again, after a good or a bad read.
