@@ -52,14 +52,15 @@ async def _shaped(plc: Program, endpoint: str) -> None:
             return reply.json.get("value", reply.json.get("error"))
 
         good = {"quality": "good"}
+        computed = {**good, "origin": "computed"}
         assert await read("mode") == {"value": 1, "text": "auto", **good}
         assert await read("status/pump") == {"value": False, **good}
         assert await read("status/fault") == {"value": True, **good}
         assert await read("version") == {"value": 0x12, **good}
         assert await read("level") == {"value": 50.0, **good}
         assert await read("flow") == {"value": 235.388, **good}
-        assert await read("sum") == {"value": 285.39, **good}
-        assert await read("share") == {"value": 235.388, **good}
+        assert await read("sum") == {"value": 285.39, **computed}
+        assert await read("share") == {"value": 235.388, **computed}
 
         assert await write("mode", b'"off"') == 0
         assert await write("mode", b"7") == "bad-value"
@@ -70,12 +71,13 @@ async def _shaped(plc: Program, endpoint: str) -> None:
         words = [int(plc.tell(f"get 1 D {number}")) for number in range(500, 504)]
         assert words == [0, 0b1001, 0xABFE, 8000]
 
-        assert await read("sum") == {"value": 260.39, **good}
+        assert await read("sum") == {"value": 260.39, **computed}
         assert await read("share") == {
             "value": None,
             "quality": "bad",
             "reason": "not-a-number",
             "detail": "division by zero",
+            "origin": "computed",
         }
         assert await read("parts") == {"value": 65530, **good}
         plc.tell("set 1 D 510 3")

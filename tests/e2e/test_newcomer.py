@@ -39,7 +39,7 @@ def test_the_example_runs_and_its_proposed_commands_work(tmp_path: Path) -> None
         assert "acknowledged" in done.out
         everything = _typed([*read[: read.index("read") + 1], str(path)])
         assert everything.code == 0
-        assert everything.out.count(" good ") == 27
+        assert everything.out.count(" good, simulated ") == 27
         assert program.end(signal.SIGINT) == 0
 
 

@@ -77,9 +77,10 @@ async def test_noise_makes_no_wrong_value_and_no_exception(noise: float) -> None
         line.bench.noise = 0.0
         await asyncio.sleep(70)
         assert all(line.good(dev) for dev in devices)
-        # Words: two bits that cancel in one reply; theory and measurement: docs/residual-errors.md.
-        blind = {1e-4: 0, 1e-3: 6, 1e-2: 40}[noise]
-    assert len(witness.wrong) <= blind
+        # Two bits that cancel, in a reply, or in a request, which then reads other words: theory
+        # and measurement are in docs/residual-errors.md.
+        blind = {1e-4: 0, 1e-3: 3, 1e-2: 30}[noise]
+    assert len({at for at, _, _ in witness.wrong}) <= blind
     assert witness.right > 1000
 
 
