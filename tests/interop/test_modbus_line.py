@@ -191,6 +191,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
             missing = next(tag for tag in device.tags if tag.text == "holding:10000")
             await until(lambda: missing in line.now and line.reason(missing) is Reason.REFUSED)
             there = [tag for tag in device.tags if tag is not missing]
+            await until(lambda: set(there) <= line.now.keys())
             await until(lambda: all(line.now[tag].quality is Quality.GOOD for tag in there))
             assert {tag.text: line.now[tag].value for tag in there} == {
                 tag.text: expected(tag.text) for tag in there
