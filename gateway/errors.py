@@ -10,6 +10,7 @@ GatewayError
 ├── NotAllowed           sign the request; nothing was done
 ├── Repeated             a signed request arrived twice: the first one may have been done
 ├── NothingToAcknowledge look at the alarm again
+├── NoHistory            ask without a time: nothing of the past is kept
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
@@ -60,6 +61,13 @@ class Repeated(GatewayError):
 
 class NothingToAcknowledge(GatewayError):
     """An acknowledgement of an alarm that is normal, or was raised again."""
+
+
+class NoHistory(GatewayError):
+    """A query for the past to a gateway that keeps no history."""
+
+    def __init__(self) -> None:
+        super().__init__("no history is kept here: ask without _time")
 
 
 class Superseded(Busy):

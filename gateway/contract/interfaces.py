@@ -140,8 +140,9 @@ class Keyed(Protocol):
     def entries(self) -> Sequence[tuple[str, Callable[[], bytes]]]:
         """Returns the path of each document, and what makes it. Any thread may call both."""
 
-    def recorded(self, history: History, time_range: str, now: int) -> Iterator[tuple[str, str]]:
-        """Yields recorded documents with their paths, as JSON. Raises as `History.samples`."""
+    def recorded(self, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+        """Yields recorded documents with their paths, as JSON. Raises as `History.samples`, and
+        `NoHistory`. Any thread may call it."""
 
     async def order(self, path: str, data: bytes, by: str | None) -> bytes:
         """Carries out the order of a client that may write, and returns the new document.

@@ -57,6 +57,7 @@ _PROBLEMS: Mapping[type, Problem] = {
     errors.Busy: Problem.BUSY,
     errors.Offline: Problem.NO_REPLY,
     errors.Damaged: Problem.DAMAGED,
+    errors.NoHistory: Problem.NO_HISTORY,
     errors.Unknown: Problem.UNKNOWN_TAG,
     errors.NotAllowed: Problem.NOT_ALLOWED,
     errors.NothingToAcknowledge: Problem.NOTHING_TO_ACKNOWLEDGE,

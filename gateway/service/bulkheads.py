@@ -213,7 +213,10 @@ class Bulkheads:
         return [one.part for one in self._all if isinstance(one.part, capability)]
 
     def has_keys(self, part: str) -> bool:
-        return any(one.name == part and one.kind.serves is Keyed for one in self._all)
+        return any(
+            one.name == part and one.kind.serves is Keyed and (one.part is not None or one.why)
+            for one in self._all
+        )
 
     def keyed(self, part: str) -> Keyed:
         for one in self._all:

@@ -54,6 +54,21 @@ def test_a_change_is_seen(tmp_path: Path, how: str) -> None:
     assert broken(path)
 
 
+def test_records_are_found_while_the_file_is_renamed_and_written(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    file = AuditFile(path, most=2000)
+    file.append(events(3))
+    found = read(path)
+    first = next(found)
+    for n in range(3, 60):
+        file.append(events(1, n))
+    seen = [first, *found]
+    assert seen == [*read(path)][: len(seen)]
+    with path.open("ab") as written:
+        written.write(b'{"n":99,"time":"2026-11-21T')
+    assert values(path) == list(range(60))
+
+
 def test_the_files_are_bounded_and_their_chain_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     file = AuditFile(path, most=2000)

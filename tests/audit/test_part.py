@@ -1,6 +1,7 @@
 """The audit of a running gateway: on disk within a moment, and it says what it left out."""
 
 import asyncio
+import json
 import signal
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,25 @@ async def test_what_does_not_fit_is_counted_and_said(
     ]
 
 
+async def asked_by_time(client: ZenohPeer, path: Path) -> None:
+    """Each record is served as it is in the file, on a key of its own."""
+    key = "plant/@gateway/demo/audit"
+    answers = await client.get(f"{key}/*?_time=[now(-1h)..]")
+    lines = path.read_bytes().splitlines()
+    assert sorted(answer.payload for answer in answers) == sorted(lines)
+    assert {answer.key for answer in answers} == {f"{key}/{n + 1}" for n in range(len(lines))}
+    third = json.loads(lines[2])["time"]
+    [answer] = await client.get(f"{key}/*?_time=[{third}..{third}]")
+    assert answer.payload == lines[2]
+    assert len(await client.get(f"{key}/*?_time=[..];limit=3")) == 3
+    assert await client.get(f"{key}/*?_time=[..2020-01-01T00:00:00Z]") == []
+    [wrong] = await client.get(f"{key}/*?_time=yesterday")
+    assert wrong.json["error"] == "bad-query"
+    assert await client.get(f"{key}/*") == []
+    [refused] = await client.get(f"{key}/1", b"?")
+    assert refused.json["error"] == "unknown-tag"
+
+
 async def test_writes_and_acknowledgements_are_there_after_a_kill(tmp_path: Path) -> None:
     endpoint, path = free_endpoint(), tmp_path / "audit.jsonl"
     tags = {
@@ -72,6 +92,7 @@ async def test_writes_and_acknowledgements_are_there_after_a_kill(tmp_path: Path
             [acknowledged] = await client.get(key, b'{"by": "Ana"}')
             assert acknowledged.json["state"] == "acknowledged"
             await asyncio.to_thread(until, lambda: b"Ana" in path.read_bytes(), "it is on disk")
+            await asked_by_time(client, path)
             first.end(signal.SIGKILL)
     found = records(path)
     assert [one["value"] for one in found if one.get("outcome") == "written"] == list(range(5))

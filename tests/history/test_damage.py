@@ -18,8 +18,16 @@ from gateway.parts.history.store.schema import ForeignFile
 from gateway.tags import Sample, Tag, good
 from gateway.tags.recorded import RecordedQuery
 from gateway.values import Value
-from tests.history.recorded import NOON, SECOND, all_runs, history, numbered, store_run
-from tests.history_writer import tag
+from tests.history.recorded import (
+    NOON,
+    SECOND,
+    all_runs,
+    history,
+    moved_aside,
+    numbered,
+    store_run,
+)
+from tests.history_writer import tag, until
 
 ALWAYS = TimeRange(EARLIEST, LATEST)
 TAGS = [tag(f"t{n}") for n in range(7)]
@@ -102,6 +110,39 @@ def test_a_flipped_bit_is_told_or_harmless(tmp_path: Path) -> None:
         except (sqlite3.Error, UnicodeDecodeError, ForeignFile, Busy, Damaged):
             continue  # the file is moved aside, or the answer is an error
     assert told_of > FLIPS / 4
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "CREATE TRIGGER no BEFORE INSERT ON sample BEGIN SELECT RAISE(ABORT, 'no'); END",
+        "CREATE TRIGGER gone AFTER INSERT ON sample BEGIN DELETE FROM sample; END",
+        "CREATE UNIQUE INDEX one ON sample (id)",
+        "ALTER TABLE run ADD COLUMN more",
+        "DROP TABLE written",
+    ],
+)
+def test_a_file_with_another_schema_is_moved_aside_and_recording_goes_on(
+    tmp_path: Path, change: str
+) -> None:
+    path = tmp_path / "h.db"
+    recorded(path)
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(change)
+    with history(path) as historian:
+        historian.record(numbered(20))
+        document = until(historian, state="ok", stored=20)
+    assert (len(moved_aside(tmp_path)), len(document["aside"])) == (1, 1)
+
+
+def test_a_view_of_a_person_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    recorded(path)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE VIEW mine AS SELECT * FROM sample")
+    with closing(HistoryFile(path, 10**8)) as file:
+        assert file.next_number() > 1000
+    assert moved_aside(tmp_path) == []
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ No message here shows the content of a file.
 import os
 import re
 import stat
+import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -97,6 +98,8 @@ _MOST = 100  # clients
 _LINE = re.compile(r"([\w.\-]{1,60}):([\w.\-~+/=]{20,200})\Z")
 _OLD_LINE = re.compile(r"[\w.\-]{1,60}:[\w.\-]{8,100}:[0-9a-fA-F]{64}\Z")
 _CHECK_EVERY = 1.0  # seconds between two looks at the file
+_WAIT = 0.2  # seconds for a look: the event loop waits for it
+HANGS = 10.0  # seconds: a file that does not answer for so long holds no secret
 
 
 class NamedSecrets:
@@ -107,29 +110,41 @@ class NamedSecrets:
         """`called`: the setting that names the file, such as `writers.file`."""
         self._path = path
         self._called = called
-        self._checked = time.monotonic()
+        self._looked = time.monotonic()
+        self._look = threading.Thread()
         self._version = self._stat()
         self._secrets = _load(path, called)
 
     def current(self) -> Mapping[str, bytes]:
-        """Returns the secrets by name, those of the file at most a second ago."""
-        now = time.monotonic()
-        if now - self._checked < _CHECK_EVERY:
-            return self._secrets
-        self._checked = now
-        version = self._stat()
-        if version != self._version:
-            self._version = version
-            self._reload()
+        """Returns the secrets by name, those of the file at most a second ago.
+
+        A thread looks at the file: a network file system may hang.
+        """
+        age = time.monotonic() - self._looked
+        if self._look.is_alive():
+            if age > HANGS and self._secrets:
+                self._reject(f"{self._called} {self._path} does not answer")
+        elif age >= _CHECK_EVERY:
+            self._looked += age
+            self._look = threading.Thread(target=self._reload, name="secrets", daemon=True)
+            self._look.start()
+            self._look.join(_WAIT)
         return self._secrets
 
     def _reload(self) -> None:
+        version = self._stat()
+        if version == self._version:
+            return
         try:
             self._secrets = _load(self._path, self._called)
             log.info("secrets reloaded", file=self._called, count=len(self._secrets))
         except ConfigError as error:
-            self._secrets = {}
-            log.error("secrets rejected", why=str(error), so="every write is refused")  # noqa: TRY400  (a sentence, no trace)
+            self._reject(str(error))
+        self._version = version
+
+    def _reject(self, why: str) -> None:
+        self._secrets, self._version = {}, None
+        log.error("secrets rejected", why=why, so="every write is refused")
 
     def _stat(self) -> tuple[int, ...] | None:
         try:

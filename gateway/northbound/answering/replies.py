@@ -16,7 +16,7 @@ from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question, question
 from gateway.contract.payload import Failure, Problem, Result
-from gateway.errors import BadValue, Busy, Damaged, GatewayError
+from gateway.errors import BadValue, Busy, Damaged, GatewayError, NoHistory
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.answering.turns import Pause, Rank, Turns
@@ -29,7 +29,6 @@ ANSWER_WITHIN = 60.0  # seconds for a whole answer of history; its client has go
 PAGE_WITHIN = 5.0  # seconds for a page
 _TOO_LONG = f"this is not all: an answer ends after {ANSWER_WITHIN:g} s. Query in pages"
 _INCOMPLETE = "the gateway is ending: this is not all"
-_NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
 
 _Row = tuple[str, str]  # the key of a reply, and its document
 
@@ -113,9 +112,9 @@ class Replies:
         try:
             history = self._parts.history()
             if history is None:
-                if tags:  # otherwise they are another gateway's, which may have a history
-                    self.outcome(_NO_HISTORY, query)
-                return
+                if tags:
+                    raise NoHistory
+                return  # they are another gateway's, which may have a history
             page = pages.page(query, self._keys.gateway)
             limit = _limit(query.parameters.get("limit"))
             asked = question(_parameters(query))
@@ -230,7 +229,9 @@ class Replies:
         `history`."""
         key = self._keys.writes
 
-        def found(history: History, time_range: str, limit: int | None) -> Iterator[_Row]:
+        def found(time_range: str, limit: int | None) -> Iterator[_Row]:
+            if (history := self._parts.history()) is None:
+                raise NoHistory
             return ((key, row) for row in history.writes(time_range, limit, now))
 
         if query.key_expr.intersects(key):
@@ -254,23 +255,17 @@ class Replies:
     def past_entries(self, part: str, now: int, query: zenoh.Query) -> None:
         """Replies with recorded documents, each on its key. `now` as in `history`."""
 
-        def found(history: History, time_range: str, limit: int | None) -> Iterator[_Row]:
-            rows = self._parts.keyed(part).recorded(history, time_range, now)
+        def found(time_range: str, limit: int | None) -> Iterator[_Row]:
+            rows = self._parts.keyed(part).recorded(time_range, now)
             keyed = ((self._keys.status(f"{part}/{path}"), row) for path, row in rows)
             return islice((one for one in keyed if query.key_expr.intersects(one[0])), limit)
 
         self._past(found, query)
 
-    def _past(
-        self, found: Callable[[History, str, int | None], Iterator[_Row]], query: zenoh.Query
-    ) -> None:
+    def _past(self, found: Callable[[str, int | None], Iterator[_Row]], query: zenoh.Query) -> None:
         try:
-            history = self._parts.history()
-            if history is None:
-                self.outcome(_NO_HISTORY, query)
-                return
             limit = _limit(query.parameters.get("limit"))
-            for key, row in found(history, query.parameters.get("_time") or "", limit):
+            for key, row in found(query.parameters.get("_time") or "", limit):
                 if self._ended:
                     raise Busy(_INCOMPLETE)
                 self._reply(query, key, row.encode(), self._stamp())

@@ -10,8 +10,8 @@ import orjson
 
 from gateway.config import Config
 from gateway.contract import payload
-from gateway.contract.interfaces import History, Keyed
-from gateway.errors import BadValue, Busy, Unknown
+from gateway.contract.interfaces import Keyed
+from gateway.errors import BadValue, Busy, NoHistory, Unknown
 from gateway.parts.alarms.board import Alarms, Entry
 from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.alarms.machine import Event, State
@@ -123,7 +123,9 @@ class AlarmPart:
         found = list(self.alarms.entries.items())
         return [(key, partial(self.document, entry)) for key, entry in found]
 
-    def recorded(self, history: History, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+    def recorded(self, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+        if (history := self._core.history()) is None:
+            raise NoHistory
         for row in history.alarms(time_range, None, now):
             yield str(orjson.loads(row)["alarm"]), row
 

@@ -7,15 +7,19 @@ the log. The files block.
 
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import orjson
 
 from gateway import files
+from gateway.contract.past.timerange import LATEST, TimeRange
 from gateway.tags.timestamps import rfc3339
+
+_HEAD = re.compile(rb'\{"n":([0-9]{1,18}),"time":"([0-9TZ:.-]{20,30})",')
 
 
 class Link(NamedTuple):
@@ -84,6 +88,15 @@ def checked(found: Iterable[bytes]) -> Iterator[Checked]:
         yield Checked(number, time, event, why)
 
 
+def within(found: Iterable[bytes], asked: TimeRange) -> Iterator[tuple[int, bytes]]:
+    """Yields the lines of records of a time, as they are in the file, with their numbers."""
+    first, last = rfc3339(max(asked.first, 0)), rfc3339(min(asked.last, LATEST))
+    for line in found:
+        head = _HEAD.match(line)
+        if head is not None and first <= head[2].decode() <= last:
+            yield int(head[1]), line
+
+
 def _hash(line: bytes) -> str:
     return hashlib.sha256(line).hexdigest()
 
@@ -145,11 +158,20 @@ class AuditFile:
 
 
 def read(path: Path) -> Iterator[bytes]:
-    """Yields the lines of all files, the oldest first. Raises `OSError`."""
-    for one in [*(_older(path, number) for number in range(OLDER, 0, -1)), path]:
-        with suppress(FileNotFoundError), one.open("rb") as file:
+    """Yields the whole lines of all files, the oldest first, also while records are written.
+
+    Raises `OSError`.
+    """
+    with ExitStack() as opened:
+        found = dict[int, BinaryIO]()  # by inode: a file that was renamed meanwhile is found twice
+        for one in [path, *(_older(path, number) for number in range(1, OLDER + 1))]:
+            with suppress(FileNotFoundError):
+                file: BinaryIO = opened.enter_context(one.open("rb"))
+                found.setdefault(os.fstat(file.fileno()).st_ino, file)
+        for file in reversed(found.values()):
             for line in file:
-                yield line.removesuffix(b"\n")
+                if line.endswith(b"\n"):
+                    yield line[:-1]
 
 
 def _older(path: Path, number: int) -> Path:

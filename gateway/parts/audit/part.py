@@ -3,14 +3,17 @@
 import asyncio
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
 import orjson
 import structlog
 
-from gateway.parts.audit.file import AuditFile, Event
+from gateway.contract.interfaces import Keyed
+from gateway.contract.past import timerange
+from gateway.errors import Busy, Unknown
+from gateway.parts.audit.file import AuditFile, Event, read, within
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.plant.threads import off_loop
 
@@ -25,6 +28,7 @@ class AuditPart:
     """Belongs to the event loop. Bounded: what does not fit is counted, and the audit says so."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = AuditFile(path)
         self._waiting: deque[Event] = deque()
         self._left_out = 0
@@ -49,6 +53,23 @@ class AuditPart:
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         return {"files/audit": {"trouble": self._trouble}}
+
+    # -- the contract of `Keyed` --
+
+    def entries(self) -> Sequence[tuple[str, Callable[[], bytes]]]:
+        """Nothing: the audit has only a past."""
+        return ()
+
+    def recorded(self, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+        asked = timerange.time_range(time_range, now)
+        try:
+            for number, line in within(read(self._path), asked):
+                yield str(number), line.decode(errors="replace")
+        except OSError as error:
+            raise Busy(f"the audit cannot be read: {error.strerror}") from None
+
+    async def order(self, path: str, data: bytes, by: str | None) -> bytes:
+        raise Unknown("the audit takes no orders")
 
     async def run(self) -> None:
         self._add({"event": "begins"})
@@ -108,4 +129,4 @@ def _make(core: Core) -> Part | None:
     return None if path is None else AuditPart(path)
 
 
-KIND = Kind(_make, Phase.KEEPING)
+KIND = Kind(_make, Phase.KEEPING, serves=Keyed)

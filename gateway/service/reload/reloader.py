@@ -11,6 +11,7 @@ import structlog
 from gateway import files as disk
 from gateway.config import Config, ConfigErrors, load
 from gateway.config.changes import Difference, needs_restart
+from gateway.errors import GatewayError
 from gateway.plant.threads import off_loop
 from gateway.tags.timestamps import rfc3339
 
@@ -18,6 +19,7 @@ log = structlog.get_logger("gateway")
 
 _SO = "the gateway goes on with the file as it was"
 _MOST_LOGGED = 20  # mistakes
+READ_WITHIN = 120.0  # seconds: a network file system may hang
 
 
 class Reloader:
@@ -51,7 +53,10 @@ class Reloader:
         """Waits until a reload is wanted. Returns the content of the file; None: it is refused."""
         await self._wanted.wait()
         self._wanted.clear()
-        found = await off_loop(self._read)
+        try:
+            found = await off_loop(self._read, within=READ_WITHIN)
+        except GatewayError:
+            found = [f"{self._path}, or a file that it names, does not answer"]
         if isinstance(found, Config):
             return found
         self.refuse(found)

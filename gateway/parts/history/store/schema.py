@@ -1,6 +1,7 @@
 """The tables of the history file."""
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 from gateway.parts.history.answers.outcomes import Ring
@@ -30,6 +31,11 @@ _OUTCOMES = """
 CREATE TABLE {0} (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
 CREATE INDEX {0}_time ON {0} (time);
 """
+_SCRIPT = (
+    f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
+    f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {''.join(map(_OUTCOMES.format, Ring))}"
+    " COMMIT;"
+)
 
 
 class ForeignFile(Exception):
@@ -39,18 +45,28 @@ class ForeignFile(Exception):
 def prepare(database: sqlite3.Connection, path: Path) -> None:
     [(application,)] = database.execute("PRAGMA application_id")
     [(version,)] = database.execute("PRAGMA user_version")
-    [(tables,)] = database.execute("SELECT count(*) FROM sqlite_schema")
-    if tables and application != APPLICATION:
+    found = _tables(database)
+    if found and application != APPLICATION:
         raise ForeignFile(f"{path} is a database of another program")
-    if tables and version != SCHEMA_VERSION:
+    if found and version != SCHEMA_VERSION:
         raise ForeignFile(f"{path} has format {version}, and this gateway writes {SCHEMA_VERSION}")
     database.execute("PRAGMA page_size = 4096")
     database.execute("PRAGMA auto_vacuum = INCREMENTAL")
     database.execute("PRAGMA journal_mode = WAL")
     database.execute("PRAGMA cache_size = -4000")
-    if not tables:
-        outcomes = "".join(map(_OUTCOMES.format, Ring))
-        database.executescript(
-            f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
-            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {outcomes} COMMIT;"
-        )
+    if not found:
+        database.executescript(_SCRIPT)
+        return
+    with closing(sqlite3.connect(":memory:")) as new:
+        new.executescript(_SCRIPT)
+        if other := found ^ _tables(new):
+            raise ForeignFile(f"{path} has another {' '.join(min(other)[:2])} than this gateway's")
+
+
+def _tables(database: sqlite3.Connection) -> set[tuple[str, str, str]]:
+    """Returns tables, indexes and triggers, each with its SQL. A view changes nothing."""
+    return {
+        (str(kind), str(name), str(sql))
+        for kind, name, sql in database.execute("SELECT type, name, sql FROM sqlite_schema")
+        if kind != "view"
+    }
