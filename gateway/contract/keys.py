@@ -11,6 +11,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
     <prefix>/@gateway/<name>/alarms/…   its alarms
+    <prefix>/@gateway/<name>/audit/…    the records of its audit, by time
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
     <prefix>/@gateway/<name>/lines/<line>/@trace    the exchanges of a line, while it is watched
     <prefix>/@gateway/<name>/page     the last reply to a query with `page`

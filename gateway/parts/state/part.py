@@ -75,7 +75,7 @@ def _parse(document: Any) -> Content:
         raise ValueError(f"form {document['form']} is not {FORMAT}")
     devices = {name: _from_json(entry) for name, entry in document["devices"].items()}
     counters = {
-        str(key): CounterState(int(last), int(total))
+        str(key): CounterState(_number(last), _number(total))
         for key, (last, total) in document.get("counters", {}).items()
     }
     return devices, counters
@@ -96,7 +96,7 @@ def _from_json(entry: Mapping[str, list[Mapping[str, object]]]) -> KnownBad:
     refused = tuple(
         (
             Span(str(row["area"]), int(str(row["start"])), int(str(row["size"]))),
-            _time(str(row["since"])),
+            _number(str(row["since"])),
             str(row["code"]),
         )
         for row in entry["refused"]
@@ -105,12 +105,12 @@ def _from_json(entry: Mapping[str, list[Mapping[str, object]]]) -> KnownBad:
     return KnownBad(refused, cuts)
 
 
-def _time(text: str) -> int:
-    """Parses ns since 1970. Raises ValueError outside the years that can be shown."""
-    time = int(text)
-    if not 0 <= time <= LATEST:
-        raise ValueError(f"{text} is no time")
-    return time
+def _number(known: str | float) -> int:
+    """Returns a number that can be saved again. Raises ValueError for another one."""
+    number = int(known)
+    if not 0 <= number <= LATEST:
+        raise ValueError(f"{known} is no number from 0 to {LATEST}")
+    return number
 
 
 class StatePart:
