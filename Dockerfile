@@ -1,12 +1,16 @@
 # The first stage builds a virtual environment; the second runs it as an unprivileged user.
-FROM python:3.12-slim AS build
+# Name the image by its digest where you build: docs/deployment.md.
+ARG BASE=python:3.12-slim
+FROM ${BASE} AS build
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY gateway gateway
 RUN python -m venv /opt/gateway \
-    && /opt/gateway/bin/pip install --no-cache-dir --constraint constraints.txt .
+    && /opt/gateway/bin/pip install --no-cache-dir --require-hashes --requirement constraints.txt \
+    && /opt/gateway/bin/pip install --no-cache-dir --no-deps --no-build-isolation . \
+    && /opt/gateway/bin/pip uninstall --yes setuptools
 
-FROM python:3.12-slim
+FROM ${BASE}
 # Serial ports belong to the group dialout: docker run --device /dev/ttyUSB0 --group-add dialout ...
 RUN useradd --system --uid 10001 --user-group --groups dialout --home-dir /data --create-home gateway
 COPY --from=build /opt/gateway /opt/gateway

@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pins clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -60,12 +60,23 @@ clean:
 	the gateway needs 3.11 or newer. Name one: make PYTHON=python3.12 $(MAKECMDGOALS)' % v[:2])"
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
+	$(BIN)/pip install --quiet --require-hashes --requirement constraints.txt
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-.venv/ready: .venv/installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+.venv/ready: .venv/installed constraints-dev.txt
+	$(BIN)/pip install --quiet --require-hashes --requirement constraints-dev.txt
 	touch $@
+
+# Notes the hashes of all files of each package, for every system. `make pins NEW=--upgrade` also
+# takes newer versions.
+PINS = echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --quiet --universal $(NEW) \
+    --python-version 3.11 --generate-hashes --no-annotate --custom-compile-command 'make pins'
+
+pins: .venv/ready
+	$(BIN)/pip install --quiet 'uv~=0.13'
+	$(PINS) --output-file constraints.txt
+	$(PINS) --output-file constraints-dev.txt --all-extras --constraint constraints.txt
 
 # Long proofs (docs/proof.md); a short slice of each runs with the tests.
 SEEDS ?= 0-19

@@ -540,6 +540,7 @@ def _example_keys() -> set[str]:
             keys.own,
             keys.status("alarms"),
             keys.status("alarms/**"),
+            keys.status("audit/*"),
             keys.status("status"),
             keys.status("transfers/1"),
             keys.writes,

@@ -90,20 +90,37 @@ def test_every_target_of_the_makefile_is_phony_or_a_file() -> None:
     assert targets == set(phony.split())
 
 
-def test_every_pinned_package_is_pinned_once() -> None:
-    names = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
-    assert len(names) == len(set(names))
+def pins(file: str) -> dict[str, str]:
+    """Returns the pinned packages with their lines."""
+    text = (ROOT / file).read_text().replace("\\\n", "")
+    lines = re.findall(r"^([\w.-]+)(==.*)$", text, re.MULTILINE)
+    assert len(lines) == len({name for name, _ in lines})
+    return dict(lines)
+
+
+def test_every_pinned_package_is_pinned_by_hashes_and_in_both_files_alike() -> None:
+    of_all, own = pins("constraints-dev.txt"), pins("constraints.txt")
+    assert {name: of_all[name] for name in own} == own
+    assert [name for name, line in of_all.items() if "--hash=sha256:" not in line] == []
+    for file in ("Makefile", "Dockerfile", "docs/deployment.md"):
+        assert "--require-hashes --requirement constraints.txt" in (ROOT / file).read_text()
+
+
+def test_hosted_ci_asks_whether_a_pinned_version_has_a_known_weakness() -> None:
+    steps = workflow()["jobs"]["audit"]["steps"]
+    assert [step["run"] for step in steps if "run" in step] == ["bash .ci/audit"]
 
 
 def test_every_package_of_the_project_has_a_pin() -> None:
     def normal(name: str) -> str:
         return re.sub(r"[-_.]+", "-", name).lower()
 
-    pins = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
-    wanted = PROJECT["project"]["dependencies"]
-    wanted += PROJECT["project"]["optional-dependencies"]["dev"]
+    own = PROJECT["project"]["dependencies"]
+    wanted = [*own, *PROJECT["project"]["optional-dependencies"]["dev"]]
     named = {normal(re.split(r"[~<>=;\[ ]", requirement)[0]) for requirement in wanted}
-    assert named <= {normal(pin) for pin in pins}
+    assert named <= {normal(pin) for pin in pins("constraints-dev.txt")}
+    needed = {normal(re.split(r"[~<>=;\[ ]", one)[0]) for one in own}
+    assert needed <= {normal(pin) for pin in pins("constraints.txt")}
 
 
 def test_dependency_updates_cover_every_ecosystem() -> None:
