@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pins clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pins crowd parsers clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -109,6 +109,14 @@ operator: .venv/ready
 # Writes with faults, checked against what the PLC did.
 histories: .venv/ready
 	$(BIN)/python -m tests.faults.histories
+
+# 10,000 connections to the page of a gateway that runs.
+crowd: .venv/ready
+	$(BIN)/python -m tests.attacks.crowd 10000
+
+# Every parser, led by the branches that it takes: first `pip install atheris` (docs/proof.md).
+parsers: .venv/ready
+	$(BIN)/python -m tests.fuzz.long --minutes $(MINUTES)
 
 faults: .venv/ready
 	RESTARTS=200 $(BIN)/python -m pytest -q tests/faults
