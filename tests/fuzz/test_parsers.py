@@ -10,7 +10,7 @@ from tests.fuzz.long import kept
 from tests.fuzz.parsers import PARSERS, SEEDS
 
 EXAMPLES = int(os.environ.get("EXAMPLES", "60"))
-MOST = 1000  # bytes that are changed at random places
+MOST = 5000  # bytes that are changed at random places
 
 
 @pytest.mark.parametrize("name", PARSERS)
