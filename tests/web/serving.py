@@ -93,7 +93,14 @@ class PlainNorth:
         self.gate.set()
 
     async def documents(self, max_age: float) -> Documents:
-        status = {"name": "demo", "version": "1", "up": 5.0, "tags": 4, "refused_devices": {}}
+        status = {
+            "name": "demo",
+            "version": "1",
+            "up": 5.0,
+            "tags": 4,
+            "simulated": [],
+            "refused_devices": {},
+        }
         return {
             "status": status,
             "zenoh": ZENOH,

@@ -220,7 +220,7 @@ def _state(documents: Documents) -> dict[str, Any]:
     known = overview(documents)
     line_of = {name: line for line, one in below("lines/", documents) for name in one["devices"]}
     return {
-        **{name: known["status"][name] for name in ("name", "version", "up", "tags")},
+        **{name: known["status"][name] for name in ("name", "version", "up", "tags", "simulated")},
         "links": known["zenoh"]["to"],
         "writes": known["outcomes"]["counts"],
         "history": known.get("history", {}).get("state"),

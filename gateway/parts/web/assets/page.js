@@ -182,6 +182,7 @@ function takeState(state) {
   }
   showAlarms(state.alarms);
   known.lines = state.lines;
+  known.simulated = state.simulated;
   showLines();
   showCalls(state.calls);
   if (merge(known.transfers, state.transfers) || !known.transfers.size) showTransfers();
@@ -273,7 +274,7 @@ function showLines() {
     const shown = button.firstChild;
     if (shown.textContent !== name) shown.textContent = name;
     shown.setAttribute("aria-pressed", String(choice.line === name));
-    const text = open ? "open" : `down: ${trouble || "not opened yet"}`;
+    const text = open ? (known.simulated.includes(name) ? "simulated" : "open") : `down: ${trouble || "not opened yet"}`;
     if (state.textContent !== text) state.textContent = text;
     state.className = open ? "open" : "down";
     const loads = known.loads.get(name) ?? [];
