@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -131,8 +131,9 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def fullest(folders: Iterable[Path]) -> tuple[int, str]:
+def fullest() -> tuple[int, str]:
     """Returns the most files of a folder, and its name."""
+    folders = (path.parent for path in ROOT.rglob("__init__.py"))
     return max((len(list(one.glob("*.py"))), str(one.relative_to(ROOT.parent))) for one in folders)
 
 
@@ -156,14 +157,37 @@ def is_settings(file: str, node: ast.ClassDef) -> bool:
     return frozen or file.startswith("config/")
 
 
-def main() -> None:
-    found = list(modules())
-    classes = [
+def classes() -> list[tuple[int, int, str]]:
+    """Fields, arguments of the constructor and name of each class that is no settings record."""
+    return [
         (fields(node), arguments(node), f"{file}: {node.name}")
-        for file, tree in found
+        for file, tree in modules()
         for node in ast.walk(tree)
         if isinstance(node, ast.ClassDef) and not is_settings(file, node)
     ]
+
+
+def engine_imports() -> dict[str, set[str]]:
+    return {name: to for name, to in imports().items() if name.startswith("gateway.engine.")}
+
+
+def widest() -> tuple[int, int, str]:
+    """As `classes`, of the constructor with the most arguments."""
+    return max(classes(), key=lambda each: each[1])
+
+
+# The rows of docs/architecture.md, without those of `benchmarks.moves`.
+FIGURES: dict[str, Callable[[], list[int]]] = {
+    "modules directly in": lambda: [len(list(ROOT.glob("*.py")))],
+    "rooms, arrows": lambda: [len(arrows()), sum(map(len, arrows().values()))],
+    "most files of a folder": lambda: [fullest()[0]],
+    "assignments in": lambda: [foreign_assignments("engine")],
+    "fields of the largest class": lambda: [max(classes())[0], widest()[1]],
+}
+
+
+def main() -> None:
+    found = list(modules())
     outside = [
         file
         for file, tree in found
@@ -171,21 +195,19 @@ def main() -> None:
     ]
     circling = sum(bool(CIRCLING.match(text)) for _, tree in found for text in docstrings(tree))
     assigning = [file for file, tree in found if assigns_state(tree)]
-    largest, widest = max(classes), max(classes, key=lambda each: each[1])
+    largest, most = max(classes()), widest()
     print(f"modules directly in gateway/: {len(list(ROOT.glob('*.py')))}")
     print(f"modules outside protocols/, stations/ and serving/ that import a protocol: {outside}")
     print(f"docstrings that begin with What, Who, Whether, Where, How, That: {circling}")
     print(f"most fields of a class: {largest[0]} ({largest[2]})")
-    print(f"most arguments of a constructor: {widest[1]} ({widest[2]})")
+    print(f"most arguments of a constructor: {most[1]} ({most[2]})")
     print(f"modules that assign state of a device from outside: {assigning}")
     foreign = {room: foreign_assignments(room) for room in rooms()}
     print(f"assignments to attributes of other objects: {foreign}")
-    graph, whole = arrows(), imports()
-    engine = {name: named for name, named in whole.items() if name.startswith("gateway.engine.")}
+    graph, inside = arrows(), circle(engine_imports())
     print(f"rooms: {len(graph)}; arrows between them: {sum(map(len, graph.values()))}")
-    print(f"circles between rooms: {circle(graph)}; inside the engine: {circle(engine)}")
-    files, folder = fullest(path for path in ROOT.rglob("*") if (path / "__init__.py").exists())
-    print(f"most files of a folder: {files} ({folder})")
+    print(f"circles between rooms: {circle(graph)}; inside the engine: {inside}")
+    print("most files of a folder: {} ({})".format(*fullest()))
     print(f"modules over 300 lines, or below 40 with one importer: {crowded()}")
 
 

@@ -34,7 +34,6 @@ TINY = [
         "--seconds 6 --lines 2",
         [r"^ +2 lines x 32 .* us of CPU per sample", r"^ +6250 tags in memory: +[\d.]+ MB"],
     ),
-    ("moves", "", [r"^poll +\d+ files entered, +\d+ moves", r"^write +\d+ files entered"]),
     (
         "noise",
         "--seconds 1 --protocols Vigor --losses 25",
@@ -83,7 +82,6 @@ TINY = [
     ("served", "--seconds 0.5", [r"^served-1: \d+ replies, \d+ lost: median", r"^a written value"]),
     ("sim_speed", "--minutes 0.05", [r"^every +30 s: +[\d.]+ simulated hours per minute"]),
     ("start", "--sizes 1 2 5", [r"^\| different \| run: 10 tags answer in [\d.]+ s \| [\d.]+"]),
-    ("structure", "", [r"^most fields of a class: \d+", r"^modules that assign state"]),
     ("transactions", "--count 2 --rounds 1", [r"^  ours, 64 tags, uvloop +[\d.]+"]),
     (
         "web",

@@ -1,10 +1,41 @@
-"""Objects of the engine change by their own methods."""
+"""The shape of the code: no worse than its limits, and as architecture.md says."""
 
-from benchmarks.structure import foreign_assignments, rooms
+import re
+from pathlib import Path
 
-MOST = 15
+import pytest
+
+from benchmarks import moves, structure
+
+PAGE = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text("utf-8")
 
 
-def test_few_assignments_go_to_attributes_of_other_objects() -> None:
-    assert "engine" in rooms()
-    assert 0 < foreign_assignments("engine") <= MOST
+def now(row: str) -> list[int]:
+    """The figures of a row of the page, in its last column."""
+    [line] = [line for line in PAGE.splitlines() if line.startswith(f"| {row}")]
+    return [int(number) for number in re.findall(r"\d+", line.split("|")[-2])]
+
+
+def test_a_poll_and_a_write_enter_as_few_files_as_the_page_says() -> None:
+    found = moves.shortest()
+    rows = {"poll": "files entered, moves between files, for one", "write": "the same for one"}
+    for name, row in rows.items():
+        assert [len({call.file for call in found[name]}), moves.moves(found[name])] == now(row)
+
+
+@pytest.mark.parametrize("row", structure.FIGURES)
+def test_the_page_has_the_figures_that_are_printed(row: str) -> None:
+    assert structure.FIGURES[row]() == now(row)
+
+
+def test_the_figures_are_within_their_limits() -> None:
+    assert 0 < structure.foreign_assignments("engine") <= 15
+    arrows = structure.arrows()
+    assert 10 < len(arrows) <= 20
+    assert 50 < sum(map(len, arrows.values())) <= 125
+    assert structure.circle(arrows) == structure.circle(structure.engine_imports()) == []
+    assert structure.fullest()[0] <= 20
+
+
+def test_a_circle_is_found() -> None:
+    assert set(structure.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
