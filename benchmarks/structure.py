@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -12,9 +13,12 @@ PROTOCOLS = re.compile(r"\b(vigor|modbus|computer_link|frames)\b", re.IGNORECASE
 STATE = {"health", "record", "device", "dev"}  # names under which modules hold device state
 
 
-def modules() -> Iterator[tuple[str, ast.Module]]:
-    for path in sorted(ROOT.rglob("*.py")):
-        yield str(path.relative_to(ROOT)), ast.parse(path.read_text())
+@cache
+def modules() -> list[tuple[str, ast.Module]]:
+    return [
+        (str(path.relative_to(ROOT)), ast.parse(path.read_text()))
+        for path in sorted(ROOT.rglob("*.py"))
+    ]
 
 
 def docstrings(tree: ast.Module) -> Iterator[str]:
@@ -77,8 +81,9 @@ def foreign_assignments(room: str) -> int:
         isinstance(node, ast.Attribute)
         and isinstance(node.ctx, ast.Store)
         and getattr(node.value, "id", "") not in ("self", "cls")
-        for path in sorted((ROOT / room).rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text()))
+        for file, tree in modules()
+        if file.startswith(f"{room}/")
+        for node in ast.walk(tree)
     )
 
 
@@ -87,6 +92,7 @@ def rooms() -> list[str]:
     return sorted(path.name for path in ROOT.iterdir() if (path / "__init__.py").exists())
 
 
+@cache
 def imports() -> dict[str, set[str]]:
     """The modules of gateway/, each with those that it imports, also inside of functions."""
     known = {module_name(file): tree for file, tree in modules()}
@@ -178,16 +184,18 @@ def widest() -> tuple[int, int, str]:
 
 # The rows of docs/architecture.md, without those of `benchmarks.moves`.
 FIGURES: dict[str, Callable[[], list[int]]] = {
-    "modules directly in": lambda: [len(list(ROOT.glob("*.py")))],
-    "rooms, arrows": lambda: [len(arrows()), sum(map(len, arrows().values()))],
-    "most files of a folder": lambda: [fullest()[0]],
+    "modules directly in": lambda: [
+        len(list(ROOT.glob("*.py"))),
+        len(arrows()),
+        sum(map(len, arrows().values())),
+    ],
     "assignments in": lambda: [foreign_assignments("engine")],
     "fields of the largest class": lambda: [max(classes())[0], widest()[1]],
 }
 
 
 def main() -> None:
-    found = list(modules())
+    found = modules()
     outside = [
         file
         for file, tree in found

@@ -28,9 +28,9 @@ def standing(device: Device) -> str:
 
 def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> Document:
     """One device. Times in seconds, counts since the start. `now` by the loop's clock."""
-    record = device.record
+    record, turnaround = device.record, device.record.replies.turnaround
     read = [at for poll in polls if (at := poll.reads.at) is not None]
-    last_good = max(read, default=record.last_good)
+    last_good = max(read, default=record.recent.good)
     return {
         "protocol": device.driver.protocol,
         "station": device.driver.station,
@@ -38,12 +38,12 @@ def device_document(device: Device, polls: Sequence[PolledBlock], now: float) ->
         "diagnosis": device.diagnosis(),
         "silent_for": record.falls.lasts(now) if device.health.state is State.OFFLINE else None,
         "silences": record.falls.last_day(now),
-        "lately": {"requests": len(record.lately), "failed": dict(record.failed_lately())},
+        "lately": {"requests": len(record.recent.ends), "failed": dict(record.recent.failed())},
         "exchanges": record.exchanges,
         "writes": record.writes,
         "slowest_write": round(record.slowest_write, 4),
         "wire_time": round(record.wire_time, 3),
-        "turnaround": None if record.turnaround is None else round(record.turnaround, 4),
+        "turnaround": None if turnaround is None else round(turnaround, 4),
         "silence": round(device.silence.shorter, 5),
         "late_replies": record.late,
         "unasked_frames": record.unasked,

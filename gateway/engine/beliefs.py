@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 from gateway.engine.device.device import ECHO_PROVEN_FOR
-from gateway.engine.device.health import ALIVE_FOR, FORGOTTEN, PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.health import FORGOTTEN
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
+from gateway.engine.device.probe_pace import ALIVE_FOR, PROBE_PAUSE, PROBE_SPREAD
 from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
 from gateway.engine.device.turnaround import LEARN_EVERY

@@ -76,7 +76,6 @@ class Engine:
         self._next_job = NextJob(in_flight, health, self._polls, self._requests, effects, gap)
         shared = (self.record, self.schedule, in_flight, staleness, health, effects)
         self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
-        self._listens = listens(devices)
         self._charged: Device | None = None  # its use of the wire grows: by due polls, and probes
         self._replies = 0  # of all stations, until the port was opened
 
@@ -256,7 +255,7 @@ class Engine:
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
-        if self._listens:
+        if listens(self.devices):
             self.record.count(len(data) * self.wire.character, 0.0)  # of another master
         else:
             self.record.count_unasked(len(data))

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from gateway.engine.beliefs import BELIEFS, Belief, table
-from gateway.engine.device.health import FORGOTTEN, PROBE_SPREAD, State
+from gateway.engine.device.health import FORGOTTEN, State
+from gateway.engine.device.probe_pace import PROBE_SPREAD
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
@@ -280,7 +281,7 @@ def offline() -> Way:
     last = HOUR - 4
 
     def given_up(after: float) -> bool:
-        assert health.next_probe <= last + after + 1e-6
+        assert health.probes.due <= last + after + 1e-6
         return health.answered() and health.online
 
     return given_up
@@ -296,7 +297,7 @@ def never_read() -> Way:
     def given_up(after: float) -> bool:
         health.gave_up(HOUR, 1 + PROBE_SPREAD)
         while health.needs_resync:  # each probe of it fails too
-            probed = health.next_probe
+            probed = health.probes.due
             health.unclear(SILENCE, None, probed)
             health.gave_up(probed, 1 + PROBE_SPREAD)
         return health.state is State.STARTING and FORGOTTEN <= probed - HOUR <= after
@@ -319,11 +320,11 @@ def noise() -> Way:
     health, spoilt = link_device().health, Garbled("wrong sum", evidence=Evidence.CHECKSUM)
     for second in range(int(HOUR) + 1):
         health.unclear(spoilt, None, float(second))
-    assert health.is_noisy(HOUR)
+    assert health.probes.is_noisy(HOUR)
     late = link_device().health
     late.unclear(spoilt, None, HOUR)
     late.replied_late(0.7, 0.5, HOUR, last=False)
-    return lambda after: not (health.is_noisy(HOUR + after) or late.is_noisy(HOUR))
+    return lambda after: not (health.probes.is_noisy(HOUR + after) or late.probes.is_noisy(HOUR))
 
 
 def as_quick_as_before() -> Way:
@@ -331,7 +332,7 @@ def as_quick_as_before() -> Way:
     health.unclear(SILENCE, None, now)
     health.gave_up(now, 1.0)
     health.spoke(now + 0.25, 1.0)
-    return lambda _: health.patient and health.next_probe <= now + 0.25
+    return lambda _: health.probes.patient and health.probes.due <= now + 0.25
 
 
 def kept_requests() -> Way:
@@ -382,7 +383,7 @@ def test_damaged_replies_are_a_sign_of_life() -> None:
     for second in range(10):
         health.unclear(damaged, None, float(second))
         health.gave_up(float(second), 1.0)
-        assert health.next_probe < second + 0.1
+        assert health.probes.due < second + 0.1
     health.unclear(SILENCE, None, 60.0)
     health.gave_up(60.0, 1.0)
-    assert health.next_probe >= 61.0
+    assert health.probes.due >= 61.0

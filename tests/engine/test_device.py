@@ -109,11 +109,11 @@ def test_silence_has_its_diagnosis(dev: Device) -> None:
 
 def test_the_turnaround_is_smoothed_over_about_ten_exchanges(dev: Device) -> None:
     dev.record.count_exchanges(1, 0.0, 0.010)
-    assert dev.record.turnaround == 0.010
+    assert dev.record.replies.turnaround == 0.010
     for _ in range(10):
         dev.record.count_exchanges(1, 0.0, 0.020)
-    assert dev.record.turnaround is not None
-    assert 0.0155 < dev.record.turnaround < 0.0175
+    assert dev.record.replies.turnaround is not None
+    assert 0.0155 < dev.record.replies.turnaround < 0.0175
 
 
 def test_the_load_is_the_polls_share_of_the_lines_time(dev: Device) -> None:
@@ -141,7 +141,7 @@ def test_an_equal_turnaround_plans_nothing(
     dev, planned = device([make_tag("D0"), make_tag("D42")]), list[float]()
     monkeypatch.setattr(Device, "plan", lambda self: planned.append(self.turnaround.expected))
     for turnaround in (0.030, 0.031, 0.029, 0.028, 0.040):
-        dev.record.turnaround = turnaround
+        dev.record.replies.turnaround = turnaround
         dev.record.exchanges += 50
         dev.learn_turnaround()
         assert dev.turnaround.expected == turnaround

@@ -6,8 +6,6 @@ import pytest
 
 from gateway.engine.device.health import (
     MOST_UNANSWERED,
-    PAUSE_FIRST,
-    PROBE_PAUSE,
     TRANSITIONS,
     Event,
     Health,
@@ -15,6 +13,7 @@ from gateway.engine.device.health import (
     State,
     diagnosis,
 )
+from gateway.engine.device.probe_pace import PAUSE_FIRST, PROBE_PAUSE
 from gateway.errors import Evidence, Garbled, GatewayError, LineDown, NoReply, Unclear
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
@@ -107,7 +106,7 @@ def test_a_reply_ends_failures_resync_outstanding_request_trouble_and_pause() ->
     assert not found.needs_resync
     assert found.outstanding is None
     assert found.trouble is None
-    assert found.pause == 0.0
+    assert found.probes.pause == 0.0
     assert found.outstanding_requests(-1.0) == 0
 
 
@@ -152,9 +151,9 @@ def test_a_restart_needs_a_resync_and_keeps_the_outstanding_request() -> None:
 def test_a_restart_keeps_the_pause_of_an_offline_device() -> None:
     found = health(S.OFFLINE)
     found.restart()
-    assert found.pause == PAUSE_FIRST
+    assert found.probes.pause == PAUSE_FIRST
     found.gave_up(0.0, 1.0)
-    assert found.pause == 2 * PAUSE_FIRST
+    assert found.probes.pause == 2 * PAUSE_FIRST
 
 
 def test_a_transaction_cut_off_by_the_loss_of_the_port_leaves_its_request_outstanding() -> None:
@@ -182,8 +181,8 @@ def test_the_pause_between_probes_doubles_up_to_the_longest() -> None:
     found, pauses = health(), list[float]()
     for _ in range(9):
         found.gave_up(100.0, 1.1)
-        pauses.append(found.pause)
-        assert found.next_probe == 100.0 + 1.1 * found.pause
+        pauses.append(found.probes.pause)
+        assert found.probes.due == 100.0 + 1.1 * found.probes.pause
     assert pauses == [min(PAUSE_FIRST * 2**n, PROBE_PAUSE) for n in range(9)]
 
 
@@ -191,11 +190,11 @@ def test_probe_soon_allows_a_probe_one_second_after_the_last_one() -> None:
     found = health(S.OFFLINE)
     for _ in range(5):
         found.gave_up(100.0, 1.0)
-    assert found.next_probe == 100.0 + PROBE_PAUSE
-    found.probe_soon()
-    assert found.next_probe == 100.0 + PAUSE_FIRST
-    assert not found.may_be_probed(100.0 + PAUSE_FIRST - 0.1)
-    assert found.may_be_probed(100.0 + PAUSE_FIRST)
+    assert found.probes.due == 100.0 + PROBE_PAUSE
+    found.probes.soon()
+    assert found.probes.due == 100.0 + PAUSE_FIRST
+    assert not found.probes.may_be_sent(100.0 + PAUSE_FIRST - 0.1)
+    assert found.probes.may_be_sent(100.0 + PAUSE_FIRST)
 
 
 def test_a_restart_keeps_if_the_device_was_heard() -> None:
@@ -211,14 +210,14 @@ def test_a_restart_keeps_if_the_device_was_heard() -> None:
 def test_short_probes_are_counted_until_a_patient_one_a_reply_or_a_restart() -> None:
     found, counts = health(S.OFFLINE), []
     for short in (True, True, False, True):
-        found.probed(short=short)
-        counts.append(found.short_probes)
+        found.probes.sent(short=short)
+        counts.append(found.probes.short)
     assert counts == [1, 2, 0, 1]
     found.restart()
-    assert found.short_probes == 0
-    found.probed(short=True)
+    assert found.probes.short == 0
+    found.probes.sent(short=True)
     found.answered()
-    assert found.short_probes == 0
+    assert found.probes.short == 0
 
 
 def test_probe_tokens_grow_by_two() -> None:

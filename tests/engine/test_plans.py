@@ -113,7 +113,7 @@ def test_a_turnaround_that_cannot_make_the_plan_cheaper_plans_nothing(plans: Pla
     dev = registers(3, step=2)
     plans.rig = Rig(dev)
     plans.rig.bring(State.ONLINE)
-    dev.record.turnaround = dev.timing.turnaround / 3
+    dev.record.replies.turnaround = dev.timing.turnaround / 3
     dev.record.exchanges = LEARN_EVERY
     assert dev.learn_turnaround() is None
     assert plans.found == []
@@ -124,6 +124,6 @@ def test_plans_that_change_nothing_become_rare(plans: Plans) -> None:
     plans.rig = Rig(dev)
     for n in range(1, 2000):
         dev.record.exchanges = n * LEARN_EVERY
-        dev.record.turnaround = 0.1 if n % 2 else 1.0
+        dev.record.replies.turnaround = 0.1 if n % 2 else 1.0
         assert not dev.learn_turnaround()
     assert len(plans.found) <= 7 + 2000 / 128 + 1

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from gateway.engine.device.device import SILENT_SHARE
-from gateway.engine.device.health import PAUSE_LONGEST, State
+from gateway.engine.device.health import State
+from gateway.engine.device.probe_pace import PAUSE_LONGEST
 from gateway.engine.device.reply_shapes import QUIET
 from gateway.engine.device.turnaround import LEARN_EVERY
 from gateway.engine.jobs.jobs import (

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
+from gateway.engine.device.health import State
+from gateway.engine.device.probe_pace import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE
 from gateway.engine.jobs.jobs import Idle, Probe
 from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.jobs.request_queue import MOST_WAITING
@@ -443,13 +444,13 @@ def test_a_short_probe_waits_a_multiple_of_the_usual_turnaround_of_its_neighbour
         return job.timeout
 
     assert timeout(0.0) == UNKNOWN
-    healthy.record.turnaround = 0.03
+    healthy.record.replies.turnaround = 0.03
     assert timeout(20.0) == USUAL * 0.03
-    healthy.record.turnaround = 0.001
+    healthy.record.replies.turnaround = 0.001
     assert timeout(40.0) == SHORTEST
-    offline.record.turnaround = 0.06
+    offline.record.replies.turnaround = 0.06
     assert timeout(60.0) == USUAL * 0.06
-    offline.record.turnaround = 1.0
+    offline.record.replies.turnaround = 1.0
     assert timeout(80.0) == offline.timing.reply_timeout
 
 
@@ -485,7 +486,7 @@ def test_a_probe_uses_idle_time_if_it_ends_before_the_next_poll_is_due() -> None
     fail(offline)
     schedule.went_offline(offline, 0.0, 0.5)  # beside idle time not before 9.5
     polled(schedule, 4.0)
-    offline.health.next_probe = 0.0
+    offline.health.probes.due = 0.0
     room = probe_seconds(offline, UNKNOWN)
     assert schedule.next(5.0 - 0.9 * room) == Idle(5.0)
     assert isinstance(schedule.next(5.0 - 1.1 * room), Probe)
@@ -500,7 +501,7 @@ def test_or_if_it_takes_no_longer_than_the_longest_poll() -> None:
     fail(offline)
     schedule.went_offline(offline, 0.0, 0.5)
     polled(schedule, 4.0)
-    offline.health.next_probe = 0.0
+    offline.health.probes.due = 0.0
     assert isinstance(schedule.next(4.99), Probe)
 
 

@@ -102,9 +102,9 @@ def test_a_late_answer_counts_for_its_own_device(alive: Device, dead: Device, er
 def test_a_late_reply_of_an_offline_device_has_it_probed_at_once(dead: Device) -> None:
     for _ in range(4):
         dead.health.gave_up(11.0, 1.0)
-    assert dead.health.next_probe > 12.0
+    assert dead.health.probes.due > 12.0
     after_one(dead).take(Frame(7), 12.0)
-    assert dead.health.next_probe == 12.0
+    assert dead.health.probes.due == 12.0
 
 
 def test_a_request_is_forgotten_after_a_minute(dead: Device) -> None:

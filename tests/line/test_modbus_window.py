@@ -99,7 +99,7 @@ async def test_the_window_is_the_number_of_open_requests(window: int) -> None:
     assert 0.9 * window / 0.02 <= rate <= window / 0.02 + 1
     assert start > 0
     assert witness.wrong == []
-    assert dev.record.turnaround == pytest.approx(0.02 / window, rel=0.2)
+    assert dev.record.replies.turnaround == pytest.approx(0.02 / window, rel=0.2)
 
 
 @on_virtual_time

@@ -112,7 +112,7 @@ class Device:
     @property
     def usual_turnaround(self) -> float | None:
         """Seconds of the station for a reply, measured or from the file; None: not known yet."""
-        measured, given = self.record.turnaround, self.turnaround.configured
+        measured, given = self.record.replies.turnaround, self.turnaround.configured
         return given if measured is None else max(measured, given or 0.0)
 
     def may_be_echo(self, turnaround: float, unproven: float) -> bool:
@@ -122,7 +122,7 @@ class Device:
         It came sooner than the device ever replied, or no other reply has come without an echo for
         so long. `turnaround`: of the reply; `unproven`: since then.
         """
-        quickest = min(self.record.quickest, self.usual_turnaround or 0.0)
+        quickest = min(self.record.replies.quickest, self.usual_turnaround or 0.0)
         return unproven > ECHO_PROVEN_FOR or turnaround < quickest / 2
 
     def diagnosis(self) -> str:
@@ -136,7 +136,7 @@ class Device:
                 return f"It takes one request at a time, not {self.window}: set `window: 1`"
             return ""
         if isinstance(trouble, NoReply | Garbled) and trouble.evidence is not Evidence.SLOW:
-            trouble = self.record.usual() or trouble
+            trouble = self.record.recent.usual() or trouble
         heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
         if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
             return SWAPPED

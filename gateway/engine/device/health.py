@@ -9,16 +9,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
+from gateway.engine.device.probe_pace import ProbePace
 from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDown, NoReply
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
 
-PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
-PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
-LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
-PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
 FORGOTTEN = 60.0  # seconds after which the reply to a write of a device that is not read is lost
-PROBE_SPREAD = 0.1  # share by which it varies
 MOST_UNANSWERED = 64  # unanswered requests whose times are kept
 
 
@@ -88,13 +84,7 @@ class Health:
     outstanding: Span | None = None  # the request whose reply may still arrive
     trouble: GatewayError | None = None
     heard: Heard = Heard.NEVER
-    pause: float = 0.0  # seconds until the next probe of an offline device
-    next_probe: float = 0.0
-    short_probes: int = 0  # since the last patient one, or the last reply
-    patient: bool = False  # its next probe waits for the whole `reply_timeout`: it replies late
-    _last_probe: float = -math.inf  # of an offline device
-    _last_bytes: float = -math.inf  # damaged replies are a sign of life
-    _last_late: float = -math.inf  # a late reply, or one to an older request
+    probes: ProbePace = field(default_factory=ProbePace)
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     _asked_at: float = -math.inf  # when a request ended unclear last, before it was offline
     _probe_token: int = 0
@@ -114,7 +104,8 @@ class Health:
         """Starts again after the line was opened or lost: an older reply may still arrive."""
         self._move(Event.RESTARTED)
         self.trouble = trouble
-        self.consecutive_failures = self.short_probes = 0
+        self.consecutive_failures = 0
+        self.probes.restart()
         self.needs_resync = self.is_probed or (self.only_written and bool(self._unanswered))
 
     def reconnected(self) -> None:
@@ -130,9 +121,9 @@ class Health:
         if resynced:
             self._extra = False
         self._move(Event.ANSWERED)
-        self.consecutive_failures = self.short_probes = 0
+        self.consecutive_failures = 0
+        self.probes.replied()
         self.heard, self.trouble = Heard.REPLIED, None
-        self.pause = 0.0
         if not self._extra:
             self.needs_resync = False
             self.outstanding = None
@@ -149,9 +140,9 @@ class Health:
         self._move(Event.UNCLEAR)
         self.consecutive_failures += 1
         if isinstance(error, Garbled) and error.evidence in OF_THE_WIRE:
-            self._last_bytes = now
+            self.probes.replied_damaged(now)
         if isinstance(error, Garbled) and error.evidence is Evidence.SHAPE:
-            self._last_late = now
+            self.probes.replied_late(now)
         self._unanswered.append(now)
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
@@ -176,7 +167,7 @@ class Health:
 
         `last`: no other request is outstanding, so the next frame is no older reply.
         """
-        self._last_late = now
+        self.probes.replied_late(now)
         if last and not self._extra:
             self.needs_resync = False
             self.outstanding = None
@@ -188,51 +179,19 @@ class Health:
     def gave_up(self, now: float, spread: float) -> None:
         """Makes the device offline, and doubles the pause before its next probe.
 
-        It is short while damaged replies arrive: then the wire is the trouble.
-
         `spread`: a random factor near 1, so that many devices are not probed at once.
         """
         self._move(Event.GAVE_UP)
         self.heard = Heard.GAVE_UP
-        self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
-        if self.is_alive(now):
-            self.pause = PAUSE_ALIVE
-        self.next_probe = now + self.pause * spread
-        self._last_probe = now
+        self.probes.grow(now, spread)
         if self.only_written and now - self._asked_at >= FORGOTTEN:
             self._unanswered.clear()
             self.restart()
 
-    def may_be_probed(self, now: float) -> bool:
-        """Returns True if its last probe is old enough for one on behalf of a client."""
-        return self._last_probe + PAUSE_FIRST <= now
-
-    def is_alive(self, now: float) -> bool:
-        """Returns True if damaged replies of it arrived a short time ago."""
-        return now - self._last_bytes < ALIVE_FOR
-
-    def is_noisy(self, now: float) -> bool:
-        """Returns True if its replies are damaged on the way, and did not come late for long."""
-        return self.is_alive(now) and now - self._last_late >= LATE_FOR
-
     def spoke(self, now: float, longest_reply: float) -> None:
-        """Notes a sound frame of an offline device: it replies later than a short probe waits."""
-        if self.state is not State.OFFLINE or self.patient:
-            return
-        self.patient = True
-        if now - self._last_probe <= longest_reply:
-            self.next_probe = now
-        self.probe_soon()
-
-    def probe_soon(self) -> None:
-        """Shortens the pause, because a client waits."""
-        self.next_probe = min(self.next_probe, self._last_probe + PAUSE_FIRST)
-
-    def probed(self, *, short: bool) -> None:
-        """Counts a probe that is sent."""
-        self.short_probes = self.short_probes + 1 if short else 0
-        if not short:
-            self.patient = False
+        """Notes a sound frame, perhaps of an offline device."""
+        if self.state is State.OFFLINE:
+            self.probes.spoke(now, longest_reply)
 
     @property
     def is_probed(self) -> bool:

@@ -134,6 +134,52 @@ class LineRecord:
 
 
 @dataclass(slots=True)
+class Recent:
+    """The ends of the last requests of a device, and its last good read."""
+
+    ends: deque[str] = field(default_factory=lambda: deque(maxlen=LATELY))  # evidence, or ""
+    errors: dict[str, DeviceError] = field(default_factory=dict)  # the last one by evidence
+    good: float | None = None  # the last good read that a poll forgot, by the line's clock
+
+    def fail(self, kind: str, error: DeviceError) -> None:
+        self.ends.append(kind)
+        self.errors[kind] = error
+
+    def failed(self) -> Counter[str]:
+        """Returns the failures of the last requests by evidence."""
+        return Counter(kind for kind in self.ends if kind)
+
+    def usual(self) -> DeviceError | None:
+        """Returns the most frequent failure of the last requests, not an odd one."""
+        most = self.failed().most_common(1)
+        return self.errors[most[0][0]] if most else None
+
+    def was_good(self, at: float | None) -> None:
+        """Notes the last good read of a poll that forgets it."""
+        if at is not None:
+            self.good = at if self.good is None else max(at, self.good)
+
+
+@dataclass(slots=True)
+class Replies:
+    """The turnarounds of one station. Seconds."""
+
+    turnaround: float | None = None  # smoothed over about ten exchanges
+    quickest: float = math.inf  # of many recent exchanges
+    _quickest_now: float = math.inf  # of those that are counted at present
+    _counted: int = 0
+
+    def count(self, own: float) -> None:
+        known = self.turnaround
+        self.turnaround = own if known is None else known + 0.1 * (own - known)
+        if own < self._quickest_now:
+            self._quickest_now = own
+        self._counted += 1
+        if self._counted >= QUICKEST_OF:
+            self.quickest, self._quickest_now, self._counted = self._quickest_now, math.inf, 0
+
+
+@dataclass(slots=True)
 class Record:
     """Counts of a device since the start. Times in seconds."""
 
@@ -146,32 +192,20 @@ class Record:
     overruns: int = 0  # polls that were skipped because the one before was late
     overdue: int = 0  # blocks whose values became too old
     retries: int = 0  # failed reads that were repeated
-    last_good: float | None = None  # the last good read that a poll forgot, by the line's clock
     falls: Falls = field(default_factory=Falls)  # into silence
-    lately: deque[str] = field(default_factory=lambda: deque(maxlen=LATELY))  # evidence, or ""
-    errors: dict[str, DeviceError] = field(default_factory=dict)  # the last one by evidence
+    recent: Recent = field(default_factory=Recent)
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
     refusals: Counter[str] = field(default_factory=Counter)  # by the code of the device
-    turnaround: float | None = None  # measured
-    quickest: float = math.inf  # of many recent exchanges
-    _quickest_now: float = math.inf  # of those that are counted at present
-    _counted: int = 0
+    replies: Replies = field(default_factory=Replies)
     slowest_write: float = 0.0
 
     def count_exchanges(self, exchanges: int, characters: float, turnarounds: float) -> None:
         """Counts requests with a reply, and the seconds of their characters and turnarounds."""
         self.wire_time += characters + turnarounds
         if exchanges:
-            self.lately.append("")
+            self.recent.ends.append("")
             self.exchanges += exchanges
-            own, known = turnarounds / exchanges, self.turnaround
-            # Smoothed over about ten exchanges.
-            self.turnaround = own if known is None else known + 0.1 * (own - known)
-            if own < self._quickest_now:
-                self._quickest_now = own
-            self._counted += 1
-            if self._counted >= QUICKEST_OF:
-                self.quickest, self._quickest_now, self._counted = self._quickest_now, math.inf, 0
+            self.replies.count(turnarounds / exchanges)
 
     def count_write(self, took: float) -> None:
         self.writes += 1
@@ -180,28 +214,13 @@ class Record:
     def count_failure(self, error: DeviceError) -> None:
         kind = str(error.evidence) if isinstance(error, NoReply | Garbled) else "other"
         self.failures[kind] += 1
-        self.lately.append(kind)
-        self.errors[kind] = error
-
-    def failed_lately(self) -> Counter[str]:
-        """Returns the failures of the last requests by evidence."""
-        return Counter(kind for kind in self.lately if kind)
-
-    def usual(self) -> DeviceError | None:
-        """Returns the most frequent failure of the last requests, not an odd one."""
-        most = self.failed_lately().most_common(1)
-        return self.errors[most[0][0]] if most else None
+        self.recent.fail(kind, error)
 
     def count_refusal(self, error: Refused) -> None:
         self.refusals[error.code] += 1
 
     def count_retry(self) -> None:
         self.retries += 1
-
-    def was_good(self, at: float | None) -> None:
-        """Notes the last good read of a poll that forgets it."""
-        if at is not None:
-            self.last_good = at if self.last_good is None else max(at, self.last_good)
 
     def count_late(self) -> None:
         self.late += 1

@@ -27,10 +27,10 @@ class Turnaround:
 
     def learn(self, record: Record) -> bool:
         """Expects the measured one from now on. Returns True if the device may be planned again."""
-        if record.turnaround is None:
+        if record.replies.turnaround is None:
             return False
         self.look_at = record.exchanges + LEARN_EVERY
-        self.expected = record.turnaround
+        self.expected = record.replies.turnaround
         return record.exchanges >= self.plan_from
 
     def change(self, default: float) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST
+from gateway.engine.device.probe_pace import PAUSE_FIRST, PAUSE_LONGEST
 from gateway.engine.jobs.jobs import Poll
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span
@@ -109,7 +109,7 @@ class PollEntry:
     def every(self) -> float:
         """Seconds until it is due again. They grow while no reply arrives, and no damaged one."""
         every = self.device.interval(self.block)
-        if self.missed and not self.device.health.is_alive(self.asked):
+        if self.missed and not self.device.health.probes.is_alive(self.asked):
             every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.missed, 10), PAUSE_LONGEST))
         return every
 
@@ -217,13 +217,13 @@ class PollEntry:
 
     def forget(self, now: float) -> float:
         """Forgets the last read, because its values turn bad. Returns their age."""
-        self.device.record.was_good(self.reads.at)
+        self.device.record.recent.was_good(self.reads.at)
         return self.reads.forget(now)
 
     def came_online(self, now: float) -> None:
         """Is due at once, because its device came online. Its values are bad."""
         self.due, self.missed = now, 0
-        self.device.record.was_good(self.reads.at)
+        self.device.record.recent.was_good(self.reads.at)
         self.reads.restart()
 
     def spread(self) -> None:

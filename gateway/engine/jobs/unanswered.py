@@ -81,7 +81,7 @@ class Unanswered:
         if device.state is not State.ONLINE and not _is_error(found, frame):
             timeout = device.timing.reply_timeout
             device.health.replied_late(now - found.sent, timeout, now, last=False)
-            device.health.probe_soon()
+            device.health.probes.soon()
         return True
 
     def forget(self, frame: Any) -> None:

@@ -213,7 +213,7 @@ def _is_lost(job: Unfinished, error: DeviceError, now: float) -> bool:
     """
     device = job.device
     polled = isinstance(error, NoReply) and isinstance(job, Poll | Probe)
-    return polled and device.shapes is not None and device.health.is_noisy(now)
+    return polled and device.shapes is not None and device.health.probes.is_noisy(now)
 
 
 def _is_short(job: Unfinished) -> bool:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Hashable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from gateway.engine.device.changes import Changes
@@ -50,7 +51,7 @@ class ShorterSilences(Rule):
     def __init__(
         self, line: str, devices: Sequence[Device], in_flight: InFlight, effects: Effects
     ) -> None:
-        self._line, self._in_flight, self._effects = line, in_flight, effects
+        self._in_flight, self._tell = in_flight, partial(effects.info, line=line)
         self._devices = devices
         self._learning = _learning(devices)
         self.pace = Pace()
@@ -126,7 +127,7 @@ class ShorterSilences(Rule):
             device.silence.take_step(self.step, now)
             device.silence.keep_safe(at_rest=False)
         shortest = min(device.silence.shorter for device in self._learning)
-        self._effects.info("silences shortened", line=self._line, shortest=shortest)
+        self._tell("silences shortened", shortest=shortest)
 
     def _hold(self, now: float) -> None:
         before = [device.silence.shorter for device in self._learning]
@@ -213,7 +214,7 @@ class ShorterSilences(Rule):
         for device in self._devices:
             device.silence.take_step(0, now)
             device.silence.keep_safe(at_rest=True)
-        self._effects.info("silences restored", line=self._line, why=why)
+        self._tell("silences restored", why=why)
 
 
 def _learning(devices: Sequence[Device]) -> list[Device]:

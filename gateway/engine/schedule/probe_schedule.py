@@ -4,7 +4,8 @@ import random
 from collections.abc import Sequence
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import PROBE_SPREAD, State
+from gateway.engine.device.health import State
+from gateway.engine.device.probe_pace import PROBE_SPREAD
 from gateway.engine.jobs.jobs import Probe
 from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
@@ -40,7 +41,7 @@ class ProbeSchedule:
         if not self._any_online:
             return True
         idle = not (device.driver.traits.over_network or late)
-        return device.health.may_be_probed(now) and (idle or self._offline_lane <= now)
+        return device.health.probes.may_be_sent(now) and (idle or self._offline_lane <= now)
 
     def for_request(self, device: Device, now: float, *, due: bool) -> Probe | None:
         """Returns the probe before a request to the device, which needs a resync.
@@ -72,20 +73,20 @@ class ProbeSchedule:
         offline = [device for device in others if device.health.state is State.OFFLINE]
         if not offline:
             return until
-        device = min(offline, key=lambda device: device.health.next_probe)
-        if device.health.next_probe > now:
-            return min(until, device.health.next_probe)
+        device = min(offline, key=lambda device: device.health.probes.due)
+        if device.health.probes.due > now:
+            return min(until, device.health.probes.due)
         return self._offline(device, now, idle_until) or min(until, self._offline_lane)
 
     def _offline(self, device: Device, now: float, idle_until: float) -> Probe | None:
         """Returns the probe that the wire has time for, if any."""
-        health, alive = device.health, device.health.is_alive(now)
+        health, alive = device.health, device.health.probes.is_alive(now)
         if alive:  # its damaged replies show that the wire is the trouble
             return self.probe(device, now) if idle_until > now or self.failing_lane <= now else None
         if idle_until <= now < self._offline_lane:
             return None
         short = short_timeout(device, self._devices)
-        if short is None or health.patient or health.short_probes >= PATIENT_AFTER:
+        if short is None or health.probes.patient or health.probes.short >= PATIENT_AFTER:
             fits = idle_until - now >= probe_seconds(device)
             self._in_idle_time = fits and not device.driver.traits.over_network
             if self._in_idle_time or self._offline_lane <= now:
@@ -102,12 +103,12 @@ class ProbeSchedule:
         """Returns a probe. It is short if the device is offline, or starts, or if noise destroys
         its replies: one that has not come by then does not come."""
         health, timeout = device.health, None
-        starting = health.state is State.STARTING and not health.short_probes
-        if health.is_noisy(now) and health.short_probes < PATIENT_AFTER:
+        starting = health.state is State.STARTING and not health.probes.short
+        if health.probes.is_noisy(now) and health.probes.short < PATIENT_AFTER:
             timeout = brief_timeout(device)
         elif not patient and (starting or health.state is State.OFFLINE):
             timeout = short_timeout(device, self._devices)
-        health.probed(short=timeout is not None)
+        health.probes.sent(short=timeout is not None)
         return Probe(device, health.outstanding, health.next_probe_token(), timeout=timeout)
 
     def failed(self, now: float, took: float) -> None:
@@ -118,7 +119,7 @@ class ProbeSchedule:
     def went_offline(self, device: Device, now: float, took: float) -> None:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
         device.health.gave_up(now, self._random.uniform(1 - PROBE_SPREAD, 1 + PROBE_SPREAD))
-        if device.health.is_alive(now):
+        if device.health.probes.is_alive(now):
             self.failing_lane = now + took
             return
         if self._in_idle_time:

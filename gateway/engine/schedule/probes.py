@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import PROBE_PAUSE, PROBE_SPREAD, Heard
+from gateway.engine.device.health import Heard
+from gateway.engine.device.probe_pace import PROBE_PAUSE, PROBE_SPREAD
 
 PATIENT_AFTER = 15  # short probes of a device before one that waits for the whole `reply_timeout`
 USUAL = 3.0  # a short probe waits so many times the usual turnaround,
@@ -15,7 +16,7 @@ OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together, 
 
 def order_of_start(device: Device) -> tuple[bool, bool]:
     """Devices that were not probed yet go first, of these the ones that replied last time."""
-    return device.health.short_probes > 0, device.health.heard is not Heard.REPLIED
+    return device.health.probes.short > 0, device.health.heard is not Heard.REPLIED
 
 
 def short_timeout(device: Device, devices: Sequence[Device]) -> float | None:

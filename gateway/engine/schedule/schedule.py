@@ -164,7 +164,7 @@ class Schedule:
     def expedite(self, poll: PollEntry, *, on_demand: bool = False) -> None:
         """Polls this next, after requests, because a client waits for it."""
         if poll.device.health.state is State.OFFLINE:
-            poll.device.health.probe_soon()
+            poll.device.health.probes.soon()
         elif poll.live and poll.device.health.online:
             self._queue.expedite(poll, on_demand=on_demand)
 

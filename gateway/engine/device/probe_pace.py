@@ -1,0 +1,75 @@
+"""The pace of the probes of a device without replies: when they are due, and how patient."""
+
+import math
+from dataclasses import dataclass
+
+PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
+PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
+LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
+PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
+PROBE_SPREAD = 0.1  # share by which it varies
+
+
+@dataclass(slots=True, eq=False)
+class ProbePace:
+    """The pace of the probes of one device. Times in seconds of the line's clock."""
+
+    pause: float = 0.0  # until the next probe of an offline device
+    due: float = 0.0
+    short: int = 0  # short probes since the last patient one, or the last reply
+    patient: bool = False  # the next probe waits for the whole `reply_timeout`: it replies late
+    _last: float = -math.inf  # of an offline device
+    _last_bytes: float = -math.inf  # damaged replies are a sign of life
+    _last_late: float = -math.inf  # a late reply, or one to an older request
+
+    def restart(self) -> None:
+        self.short = 0
+
+    def replied(self) -> None:
+        self.short, self.pause = 0, 0.0
+
+    def replied_damaged(self, now: float) -> None:
+        self._last_bytes = now
+
+    def replied_late(self, now: float) -> None:
+        self._last_late = now
+
+    def grow(self, now: float, spread: float) -> None:
+        """Doubles the pause before the next probe. It is short while damaged replies arrive: then
+        the wire is the trouble."""
+        self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
+        if self.is_alive(now):
+            self.pause = PAUSE_ALIVE
+        self.due = now + self.pause * spread
+        self._last = now
+
+    def may_be_sent(self, now: float) -> bool:
+        """Returns True if the last probe is old enough for one on behalf of a client."""
+        return self._last + PAUSE_FIRST <= now
+
+    def is_alive(self, now: float) -> bool:
+        """Returns True if damaged replies of the device arrived a short time ago."""
+        return now - self._last_bytes < ALIVE_FOR
+
+    def is_noisy(self, now: float) -> bool:
+        """Returns True if its replies are damaged on the way, and did not come late for long."""
+        return self.is_alive(now) and now - self._last_late >= LATE_FOR
+
+    def spoke(self, now: float, longest_reply: float) -> None:
+        """Notes a sound frame while it was offline: it replies later than a short probe waits."""
+        if self.patient:
+            return
+        self.patient = True
+        if now - self._last <= longest_reply:
+            self.due = now
+        self.soon()
+
+    def soon(self) -> None:
+        """Shortens the pause, because a client waits."""
+        self.due = min(self.due, self._last + PAUSE_FIRST)
+
+    def sent(self, *, short: bool) -> None:
+        """Counts a probe that is sent."""
+        self.short = self.short + 1 if short else 0
+        if not short:
+            self.patient = False
