@@ -113,6 +113,8 @@ def _finite(text: str) -> int | float:
     number = parse_decimal(text)
     if not math.isfinite(number):
         raise BadValue("the number in the payload is too large")
+    if not number and text.lower().partition("e")[0].strip("-.0"):
+        raise BadValue("the number in the payload is too small: a float makes it 0")
     return number
 
 

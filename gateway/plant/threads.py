@@ -4,6 +4,8 @@ import asyncio
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
+from queue import SimpleQueue
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -47,6 +49,8 @@ async def off_loop(
 ) -> T:
     """Runs a blocking call on its own daemon thread, which delays neither the loop nor the exit.
 
+    If the system has no thread left, the calls wait for one that was started with the first.
+
     Raises what the call raises, and `GatewayError` after `within` seconds: the thread goes on.
     """
     future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
@@ -56,7 +60,11 @@ async def off_loop(
             outcome.result = function(*arguments)
 
     called = getattr(function, "__name__", type(function).__name__)
-    threading.Thread(target=run, name=f"gateway {called}", daemon=True).start()
+    spare = _spare()
+    try:
+        threading.Thread(target=run, name=f"gateway {called}", daemon=True).start()
+    except RuntimeError:
+        spare.put(run)
     try:
         async with asyncio.timeout(within):
             return await future
@@ -64,3 +72,16 @@ async def off_loop(
         if not future.cancelled():
             raise
         raise GatewayError(f"{called} did not end within {within:g} s") from None
+
+
+@cache
+def _spare() -> SimpleQueue[Callable[[], None]]:
+    """Returns the queue of the thread that takes what no new thread can."""
+    calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def take() -> None:
+        while True:
+            calls.get()()
+
+    threading.Thread(target=take, name="gateway spare", daemon=True).start()
+    return calls

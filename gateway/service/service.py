@@ -68,6 +68,7 @@ async def run(config: Config, path: Path, started: Callable[[], None] = lambda: 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end)
     loop.add_signal_handler(signal.SIGHUP, hang_up)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGHUP])  # one that came during the start
     withheld: Mapping[str, str] = {}
     with supervisor.informed():
         while (left := await _serve(reloader, withheld, stop, started, supervisor)) is not None:

@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from tests.e2e.processes import plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import gateway, plc_gateway, started, until, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
@@ -81,3 +81,21 @@ async def test_clients_see_a_reload_and_a_bad_file_changes_nothing(tmp_path: Pat
             [claim] = await client.get("plant/@gateway/demo/claim/*")
             assert claim.json["devices"] == ["mixer", "oven"]
         assert await asyncio.to_thread(program.end) == 0
+
+
+def test_a_signal_to_reload_during_the_start_ends_nothing(tmp_path: Path) -> None:
+    """systemd takes an end by SIGHUP for one that somebody wanted, and starts nothing again."""
+    tags = {"level": {"address": "D10"}}
+    file = write_config(tmp_path / "c.yaml", free_endpoint(), lines(tags))
+    with gateway("run", file) as program:
+        status = Path(f"/proc/{program.pid}/status")
+        mask = 1 << signal.SIGHUP - 1
+        until(lambda: int(_field(status, "SigBlk"), 16) & mask != 0, "the command begins")
+        os.kill(program.pid, signal.SIGHUP)
+        program.says("Zenoh session ready")
+        program.says("file reloaded")
+        assert program.end() == 0
+
+
+def _field(status: Path, name: str) -> str:
+    return status.read_text().partition(f"{name}:")[2].split()[0]

@@ -206,3 +206,25 @@ def test_a_page_that_cannot_be_read_costs_only_its_samples(tmp_path: Path) -> No
         assert found == sorted(set(range(30_000)) & set(found))
         assert 29_000 < len(found) < 30_000
         assert "damaged" in str(historian.document()["state"])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE file SET oldest = 9223372036854775807",
+        "UPDATE file SET oldest = 'x'",
+        "UPDATE file SET tags = 9223372036854775807",
+        "DELETE FROM file",
+        "INSERT INTO file SELECT * FROM file",
+        "UPDATE sample SET id = 9223372036854775806 WHERE id = 1200",
+        "UPDATE run SET id = 9223372036854775806 WHERE id = 801",
+    ],
+)
+def test_numbers_that_no_gateway_has_given_are_damage(tmp_path: Path, damage: str) -> None:
+    """A search for what they count would never end, and every start would fail again."""
+    path = tmp_path / "history.db"
+    recorded(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute(damage)
+    with pytest.raises(Damaged):
+        HistoryFile(path, 10**8)

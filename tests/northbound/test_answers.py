@@ -2,11 +2,16 @@
 
 import asyncio
 import threading
+from pathlib import Path
 from typing import Self, cast
 
+import pytest
 import zenoh
 
+from gateway.contract.access.secrets import NamedSecrets
 from gateway.northbound.answering.answers import REFUSALS_LIMIT, AnswerPool, Workers
+from gateway.plant.threads import off_loop
+from tests.northbound.access import secret
 
 PATIENCE = 300.0  # seconds; never waited for when all is well
 
@@ -98,3 +103,49 @@ async def test_a_refusal_after_the_session_has_closed_ends_no_thread() -> None:
     pool.refuse(query())
     assert await asyncio.to_thread(replied.acquire, timeout=PATIENCE)
     pool.end()
+
+
+def _no_thread(_: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_without_more_threads_of_the_system_the_first_one_works(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    workers, ran = Workers(2, "test"), threading.Semaphore(0)
+    with monkeypatch.context() as none_left:
+        none_left.setattr(threading.Thread, "start", _no_thread)
+        for _ in range(9):
+            workers.submit(ran.release)
+        for _ in range(9):
+            assert ran.acquire(timeout=PATIENCE)
+    # The system has some again: two works that wait for each other need two threads.
+    both = threading.Barrier(2)
+    for _ in range(2):
+        workers.submit(both.wait, PATIENCE)
+    workers.submit(ran.release)
+    assert ran.acquire(timeout=PATIENCE)
+    assert not both.broken
+    workers.end()
+
+
+async def test_files_are_read_although_the_system_has_no_thread_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert await off_loop(len, "one") == 3
+    monkeypatch.setattr(threading.Thread, "start", _no_thread)
+    assert await off_loop(len, "three") == 5
+    with pytest.raises(ZeroDivisionError):
+        await off_loop(divmod, 1, 0)
+    assert await off_loop(len, "again") == 5
+
+
+def test_a_secret_is_withdrawn_although_the_system_has_no_thread_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = secret(tmp_path / "writers.txt", f"alice:{'a' * 20}\n")
+    secrets = NamedSecrets(file, "writers.file")
+    file.write_text("")
+    monkeypatch.setattr(threading.Thread, "start", _no_thread)
+    monkeypatch.setattr("gateway.contract.access.secrets._CHECK_EVERY", 0.0)
+    assert secrets.current() == {}

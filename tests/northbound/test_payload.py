@@ -172,6 +172,8 @@ def test_the_audit_of_a_list_has_a_printable_size() -> None:
         b"NaN",
         b"-Infinity",
         b"1e400",
+        b"1e-400",
+        b"[-0.01e-999]",
         b"9" * 5000,
         b"12.5 13",
         b"0x10",

@@ -89,6 +89,7 @@ async def test_long_headers_and_bodies_are_refused() -> None:
         ("/api/write?tag=mixer/recipe", {"Content_Encoding": "gzip"}, b"no gzip"),
         ("/api/write?tag=mixer/recipe", {"Content_Encoding": "deflate"}, b"no deflate"),
         ("/api/alarms/acknowledge?alarm=a", {"Content_Encoding": "gzip"}, b"no gzip"),
+        ("/api/write?tag=mixer/recipe&tag=mixer/speed", {}, b"7"),
     ],
 )
 async def test_what_cannot_be_understood_is_answered_with_400(
@@ -104,3 +105,40 @@ async def test_what_cannot_be_understood_is_answered_with_400(
         assert (answer.status, client.north.written) == (400, [])
     assert TOKEN not in caplog.text
     assert "Traceback" not in caplog.text
+
+
+async def test_a_body_in_an_unknown_encoding_is_refused(tokens: Path) -> None:
+    """Its bytes may be the text of a number."""
+    headers = {"Content_Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
+    async with serving(tokens_file=tokens) as client:
+        for coding, status in (("compress", 415), ("x-own", 415), ("identity", 404)):
+            answer = await client.ask(
+                "/api/write?tag=mixer/recipe", "POST", b"7", Content_Encoding=coding, **headers
+            )
+            assert answer.status == status
+        assert len(client.north.written) == 1
+
+
+async def test_a_client_that_leaves_within_its_body_writes_nothing_and_is_no_fault(
+    tokens: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serving(tokens_file=tokens) as client:
+        reader, writer = await asyncio.open_connection("127.0.0.1", client.port)
+        writer.write(
+            b"POST /api/write?tag=mixer/recipe HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+            b"Content-Type: application/json\r\nContent-Length: 2\r\n"
+            b"Authorization: Bearer %b\r\n\r\n7" % TOKEN.encode()
+        )
+        writer.write_eof()
+        assert await reader.read() == b""
+        writer.close()
+        assert client.north.written == []
+    assert "Traceback" not in caplog.text
+
+
+async def test_no_body_follows_the_answer_to_head(tokens: Path) -> None:
+    """A proxy would take it for the next answer."""
+    async with serving(tokens_file=tokens) as client:
+        for path, status in (("/api/events", 405), ("/api/status", 200), ("/metrics", 200)):
+            head = await client.ask(path, "HEAD", Authorization=f"Bearer {TOKEN}")
+            assert (head.status, head.body) == (status, b"")

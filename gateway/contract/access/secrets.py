@@ -127,8 +127,11 @@ class NamedSecrets:
         elif age >= _CHECK_EVERY:
             self._looked += age
             self._look = threading.Thread(target=self._reload, name="secrets", daemon=True)
-            self._look.start()
-            self._look.join(_WAIT)
+            try:
+                self._look.start()
+                self._look.join(_WAIT)
+            except RuntimeError:  # the system has no thread left
+                self._reload()
         return self._secrets
 
     def _reload(self) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 
 import structlog
 import zenoh
@@ -205,30 +205,38 @@ class Workers:
         self._most = most
         self._name = name
         self._work: SimpleQueue[Callable[[], object] | None] = SimpleQueue()  # None ends a thread
-        self._idle = threading.Semaphore(0)  # threads that wait for work
         self._lock = threading.Lock()
+        self._idle = 0  # threads that wait for work
         self._count = 0
+        self.submit(int)  # starts a thread: later the system may have none left
 
     def submit(self, function: Callable[..., object], *arguments: object) -> None:
         """Called by any thread; never waits."""
-        self._work.put(partial(function, *arguments))
-        if self._idle.acquire(blocking=False):
-            return
         with self._lock:
-            if self._count >= self._most:
+            self._work.put(partial(function, *arguments))
+            if self._idle or self._count >= self._most:
+                self._idle = max(0, self._idle - 1)
                 return
-            self._count += 1
-        threading.Thread(target=self._run, name=self._name, daemon=True).start()
+            # Without more threads of the system those that run take the work in turn.
+            with suppress(RuntimeError):
+                threading.Thread(target=self._run, name=self._name, daemon=True).start()
+                self._count += 1
 
     def end(self) -> None:
         """Ends each thread when it is idle."""
         self._work.put(None)
 
+    def _next(self) -> Callable[[], object] | None:
+        with self._lock:
+            with suppress(Empty):
+                return self._work.get_nowait()
+            self._idle += 1
+        return self._work.get()
+
     def _run(self) -> None:
         try:
-            while (work := self._work.get()) is not None:
+            while (work := self._next()) is not None:
                 work()
-                self._idle.release()
             self._work.put(None)  # for the next thread
         finally:
             with self._lock:

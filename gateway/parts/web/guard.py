@@ -82,6 +82,8 @@ class Guard:
             return answer(403, "pages of other sites may not use the gateway")
         if not request.headers.get("Authorization", "").isascii():
             return answer(400, "Authorization is no ASCII text")
+        if len(request.query) > len({*request.query}):
+            return answer(400, "a parameter is there twice")
         request[BY] = self._name(request)
         if not is_open and self._needs_token(request) and not request[BY]:
             if self._tokens is None:

@@ -102,19 +102,24 @@ class Route:
     is_open: bool = False  # it needs neither a token nor a place
 
     def registered(self) -> web.RouteDef:
-        make = web.get if self.method == "get" else web.post
-        return make(self.path, self.handler)
+        if self.method == "post":
+            return web.post(self.path, self.handler)
+        # The answer to HEAD has no body: events would be taken for the next answer.
+        return web.get(self.path, self.handler, allow_head=self.kind != "text/event-stream")
 
 
 async def body(request: web.Request) -> bytes:
     """Returns the body of a request. Raises `HTTPException`."""
+    coding = request.headers.get("Content-Encoding", "identity").lower()
+    if coding not in ("identity", "gzip", "deflate"):
+        raise web.HTTPUnsupportedMediaType(reason="the body has an unknown Content-Encoding")
     try:
         async with asyncio.timeout(BODY_WITHIN):
             return await request.read()
     except TimeoutError:
         reason = f"the body did not arrive within {BODY_WITHIN:g} s"
         raise web.HTTPRequestTimeout(reason=reason) from None
-    except web.RequestPayloadError:
+    except (web.RequestPayloadError, ConnectionError):
         raise web.HTTPBadRequest(reason="the body is not what its headers say") from None
 
 

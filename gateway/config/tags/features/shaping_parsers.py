@@ -48,7 +48,7 @@ def names(value: object) -> Names:
     """Parses `{0: off, 1: auto}`."""
     if not isinstance(value, dict) or not value:
         raise ConfigError(f"{shown(value)}: write numbers with names, such as {{0: off, 1: auto}}")
-    found: dict[int, str] = {}
+    found, taken = dict[int, str](), set[str]()
     for key, name in value.items():
         if not _WHOLE.match(key):
             raise ConfigError(f"{key!r} is no whole number: write {{0: off, 1: auto}}")
@@ -56,9 +56,10 @@ def names(value: object) -> Names:
             raise ConfigError(f"{key}: {shown(name)} is no name: write a word, true in quotes")
         if int(key) in found:
             raise ConfigError(f"{int(key)} is there twice")
-        if name in found.values():
+        if name in taken:
             raise ConfigError(f"{name} is there twice: a write of the name would not be clear")
         found[int(key)] = name
+        taken.add(name)
     return Names(found)
 
 

@@ -59,6 +59,7 @@ class HistoryFile:
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
+            _check_numbers(self._database)
             self._tags, self._last_tag, _ = tags(self._database, 0)
             self.identity = identity(self._database, path)
             self._resources = undo.pop_all()
@@ -221,6 +222,17 @@ class HistoryFile:
                 self._database.execute("ROLLBACK")
 
 
+def _check_numbers(database: sqlite3.Connection) -> None:
+    """Raises `Damaged` for numbers that no gateway has given: what they count has no end."""
+    match database.execute("SELECT mark, tags, oldest FROM file").fetchall():
+        case [(bytes(), int(names), int(first))] if 0 <= names < 2**31 and 0 < first < 2**53:
+            [(pages,)] = database.execute("PRAGMA page_count")
+            if next_number(database) - first > pages * 4096:  # more samples than bytes
+                raise Damaged("the numbers of its samples are damaged")
+        case _:
+            raise Damaged("its counters are damaged")
+
+
 def identity(database: sqlite3.Connection, path: Path) -> Identity:
     """Returns the identity of the open file, if it is still at its path."""
     [(mark,)] = database.execute("SELECT mark FROM file")
@@ -279,8 +291,6 @@ def tags(database: sqlite3.Connection, after: int) -> tuple[dict[str, int], int,
     [(last,)] = database.execute("SELECT tags FROM file")
     rows = database.execute("SELECT id, key, sum FROM tag WHERE id > ?", (after,)).fetchall()
     found = {key: number for number, key, total in rows if checksum((number, key)) == total}
-    if not isinstance(last, int):
-        raise Damaged("the number of tags is damaged")
     return found, max(last, after), len(found) != last - after
 
 
