@@ -71,7 +71,7 @@ async def test_nothing_acknowledged_is_lost(tmp_path: Path) -> None:
     file = write_config(
         tmp_path / "plant.yaml",
         endpoint,
-        {"hall": vigor_line(f"tcp://127.0.0.1:{port}", tags, reply_timeout="60s")},
+        {"hall": vigor_line(f"tcp://127.0.0.1:{port}", tags, reply_timeout="2s")},
         gateway={**own, "name": "demo", "audit": "audit.jsonl", "state": "state.json"},
         alarms={"path": "alarms.json"},
         history={"path": "history.db"},
