@@ -8,7 +8,7 @@ from typing import Self, cast
 import pytest
 import zenoh
 
-from gateway.contract.access.secrets import NamedSecrets
+from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.northbound.answering.answers import REFUSALS_LIMIT, AnswerPool, Workers
 from gateway.plant.threads import off_loop
 from tests.northbound.access import secret
@@ -147,5 +147,5 @@ def test_a_secret_is_withdrawn_although_the_system_has_no_thread_left(
     secrets = NamedSecrets(file, "writers.file")
     file.write_text("")
     monkeypatch.setattr(threading.Thread, "start", _no_thread)
-    monkeypatch.setattr("gateway.contract.access.secrets._CHECK_EVERY", 0.0)
+    monkeypatch.setattr("gateway.contract.access.named_secrets._CHECK_EVERY", 0.0)
     assert secrets.current() == {}

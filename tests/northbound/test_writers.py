@@ -274,7 +274,7 @@ def test_a_withdrawn_secret_or_a_file_readable_by_all_permits_no_write(
 ) -> None:
     monotonic = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: monotonic[0])
-    monkeypatch.setattr("gateway.contract.access.secrets._WAIT", 300.0)
+    monkeypatch.setattr("gateway.contract.access.named_secrets._WAIT", 300.0)
     writers, clock = known(tmp_path)
     file = tmp_path / "writers.txt"
 

@@ -47,8 +47,8 @@ async def test_other_addresses_need_a_token_for_every_value(tokens: Path) -> Non
 async def test_a_withdrawn_token_is_refused_within_a_second(
     tokens: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.contract.access.secrets._CHECK_EVERY", 0.0)
-    monkeypatch.setattr("gateway.contract.access.secrets._WAIT", 300.0)
+    monkeypatch.setattr("gateway.contract.access.named_secrets._CHECK_EVERY", 0.0)
+    monkeypatch.setattr("gateway.contract.access.named_secrets._WAIT", 300.0)
     async with serving(host="0.0.0.0", tokens_file=tokens) as client:
         assert (await client.ask("/metrics", Authorization=f"Bearer {TOKEN}")).status == 200
         reader, writer = await asyncio.open_connection("127.0.0.1", client.port)

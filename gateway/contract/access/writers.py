@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gateway.contract.access import signatures
-from gateway.contract.access.secrets import NamedSecrets
+from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.errors import NotAllowed, Repeated
 from gateway.tags.timestamps import rfc3339
 

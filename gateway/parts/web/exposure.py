@@ -1,7 +1,7 @@
 """Checks the settings of the HTTP side, without opening anything."""
 
 from gateway.config import Config
-from gateway.contract.access.secrets import NamedSecrets
+from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.parts.web.settings import WebSection
 
 

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
-from gateway.contract.access.secrets import NamedSecrets
+from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.parts.web.connections import Connections, Places, client_of
 from gateway.parts.web.routes import answer, send
 from gateway.parts.web.settings import WebSection
