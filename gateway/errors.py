@@ -13,6 +13,7 @@ GatewayError
 ├── NoHistory            ask without a time: nothing of the past is kept
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
+│   └── WrongDevice      another device replies in its place; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
 │   └── CallEnded        dial again later: the modem is there, the telephone call is not
 └── DeviceError          one device, one transaction
@@ -80,6 +81,10 @@ class Damaged(GatewayError):
 
 class Offline(GatewayError):
     """A write to an offline device; nothing has been sent."""
+
+
+class WrongDevice(Offline):
+    """A write to a device that is not the one of the file; nothing has been sent."""
 
 
 class LineDown(GatewayError):

@@ -23,6 +23,7 @@ STATUS = {  # by the reason of a bad value
     "overdue": Code.BadResourceUnavailable,
     "disabled": Code.BadOutOfService,
     "not-a-number": Code.BadSensorFailure,
+    "wrong-device": Code.BadConfigurationError,
 }
 TYPES = {  # by the type of a tag; the others are texts
     "bool": Type.Boolean,

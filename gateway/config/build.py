@@ -1,13 +1,13 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config.line_rules import check_line, line_wire, modem_of
-from gateway.config.messages import Mistakes, Path, meant, shown
+from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.settings import parsers
 from gateway.config.settings.model import DeviceSection, LineSection
 from gateway.config.settings.records import Config, LineConfig
@@ -32,8 +32,11 @@ from gateway.config.tags.word_tags import check_overlaps
 from gateway.config.transfers.rows import TransferRows
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
+from gateway.protocols.capabilities import Identifies
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS
+from gateway.tags import Tag
+from gateway.tags.tag import READ
 from gateway.transport.port import ModemAddress, SerialPath, SimulatorAddress
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
@@ -210,6 +213,7 @@ class Builder:
             **{name: given for name, given in own_times.items() if given is not None},
             learn_silence=default.learn_silence and settings.silence is None,
         )
+        self._check_identity(settings.identity, driver, tags, (*path, "identity"))
         late_guard = settings.late_guard
         return DeviceSettings(
             name=name,
@@ -218,12 +222,28 @@ class Builder:
             turnaround=settings.turnaround,
             late_guard=timing.reply_timeout if late_guard is None else late_guard,
             verify_reads=settings.verify_reads,
+            identity=settings.identity,
             blocks=settings.blocks,
             control=settings.control,
             enabled=settings.enabled,
             tags=tags,
             served=served,
         )
+
+    def _check_identity(
+        self, names: Iterable[str], driver: AnyDriver, tags: Sequence[Tag], path: Path
+    ) -> None:
+        own = driver.identity_names if isinstance(driver, Identifies) else ()
+        areas = driver.areas
+        read = [tag for tag in tags if tag.origin == READ and tag.polled]
+        known = {tag.name for tag in read if areas[tag.span.area].readable}
+        for name in set(names) - known - set(own):
+            also = f", or {one_of(sorted(own))}" if own else ""
+            self.mistakes.add(
+                (*path, name),
+                f"a {driver.protocol} device does not tell {name}: name a tag of it that is read, "
+                f"such as one with its serial number{also}",
+            )
 
     def _driver(self, protocol: object, own: dict[str, Any], path: Path) -> AnyDriver | None:
         place = (*path, "protocol")

@@ -141,6 +141,9 @@ def _check_listening(
                 "learned from another master: remove listen_only, or this device",
             )
             continue
+        if device.identity:
+            text = "a line with `listen_only: true` asks no device which one it is"
+            mistakes.add((*place[:-1], "identity"), text)
         other = framings.setdefault(driver.framing, device.name)
         first = next(iter(framings.values()))
         if other != first:

@@ -32,6 +32,9 @@ def line_fault(line: str, document: Document, devices: Sequence[Named]) -> Itera
         why = document["trouble"] or "not opened yet"
         yield f"line {line} is down: {why}{_past(document, 'down_for', 'losses')}"
         return
+    for name, one in devices:
+        if is_another(one):
+            yield f"{name}: {one['diagnosis']}"
     silent = [(name, one) for name, one in devices if one["standing"] == "silent"]
     for alike in _alike(silent):
         name, first = alike[0]
@@ -47,9 +50,15 @@ def line_fault(line: str, document: Document, devices: Sequence[Named]) -> Itera
             )
 
 
+def is_another(device: Document) -> bool:
+    """Returns True if the device that replies is not the one of the file."""
+    return (device.get("identity") or {}).get("verdict") == "wrong"
+
+
 def device_warnings(line: str, devices: Sequence[Named]) -> Iterator[str]:
     """Yields the diagnoses of devices that reply."""
-    for alike in _alike([(name, one) for name, one in devices if one["diagnosis"]]):
+    told = [(name, one) for name, one in devices if one["diagnosis"] and not is_another(one)]
+    for alike in _alike(told):
         name, first = alike[0]
         if len(alike) == 1:
             yield f"{name}: {first['diagnosis']}"

@@ -37,6 +37,7 @@ class Problem(StrEnum):
     UNCLEAR = "unclear"  # the device may or may not have executed it
     LINE_DOWN = "line-down"
     NO_REPLY = "no-reply"  # the device is silent; nothing was sent
+    WRONG_DEVICE = "wrong-device"  # another device replies in its place; nothing was sent
     BUSY = "busy"  # too many requests are waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
     NOT_SENT = "not-sent"  # a tag of a group: another one was wrong, or not done before it
@@ -56,6 +57,7 @@ _PROBLEMS: Mapping[type, Problem] = {
     errors.LineDown: Problem.LINE_DOWN,
     errors.Busy: Problem.BUSY,
     errors.Offline: Problem.NO_REPLY,
+    errors.WrongDevice: Problem.WRONG_DEVICE,
     errors.Damaged: Problem.DAMAGED,
     errors.NoHistory: Problem.NO_HISTORY,
     errors.Unknown: Problem.UNKNOWN_TAG,

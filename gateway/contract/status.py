@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
+from gateway.engine.device.identity import Identity
 from gateway.engine.device.records import CallRecord, CallState
 from gateway.engine.dial_schedule import DialSchedule
 from gateway.engine.engine import Engine
@@ -15,6 +16,7 @@ from gateway.planning.planner import describe
 from gateway.tags.timestamps import rfc3339
 
 MOST_REQUESTS = 200
+MOST_TOLD = 10  # texts of one name
 # The words of the status documents; users read them since the first version.
 _STANDING = {State.ONLINE: "up", State.OFFLINE: "silent"}
 Document = Mapping[str, object]
@@ -36,6 +38,7 @@ def device_document(device: Device, polls: Sequence[PolledBlock], now: float) ->
         "station": device.driver.station,
         "standing": standing(device),
         "diagnosis": device.diagnosis(),
+        "identity": None if device.identity is None else _identity(device.identity),
         "silent_for": record.falls.lasts(now) if device.health.state is State.OFFLINE else None,
         "silences": record.falls.last_day(now),
         "lately": {"requests": len(record.recent.ends), "failed": dict(record.recent.failed())},
@@ -59,6 +62,11 @@ def device_document(device: Device, polls: Sequence[PolledBlock], now: float) ->
         ],
         "requests": [_request(poll) for poll in polls[:MOST_REQUESTS]],
     }
+
+
+def _identity(identity: Identity) -> Document:
+    told = {name: list(texts[:MOST_TOLD]) for name, texts in identity.told.items()}
+    return {"verdict": identity.verdict.value, "wanted": dict(identity.wanted), "told": told}
 
 
 def _request(poll: PolledBlock) -> Document:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from gateway.engine.device.device import ECHO_PROVEN_FOR
 from gateway.engine.device.health import FORGOTTEN
+from gateway.engine.device.identity import SILENT_FOR
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
 from gateway.engine.device.probe_pace import ALIVE_FOR, PROBE_PAUSE, PROBE_SPREAD
@@ -121,6 +122,13 @@ BELIEFS = (
         "time: it is tried again",
         "function 22 in place of reading and writing the word",
         LACKED_FOR,
+    ),
+    Belief(
+        "is silent about its identity",
+        "three questions without a reply, before it ever told it",
+        "time: it is asked again",
+        "only the right device is read",
+        SILENT_FOR,
     ),
     Belief(
         "a device is busy",

@@ -84,6 +84,8 @@ class DialSchedule:
         effects = [] if engine.is_open else engine.opened(now)
         for device in engine.devices:
             device.health.reconnected()
+            if device.identity is not None:
+                device.identity.doubt(now)
             device.monitor.forget()
         engine.schedule.take_along(now)
         return effects

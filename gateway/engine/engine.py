@@ -15,6 +15,7 @@ from gateway.engine.device.records import LineRecord
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.jobs.jobs import (
     Answer,
+    Identify,
     Idle,
     Job,
     Poll,
@@ -29,6 +30,7 @@ from gateway.engine.jobs.poll_entry import PolledBlock, PollEntry
 from gateway.engine.jobs.requests import Request, Write, why_not_commanded
 from gateway.engine.jobs.unanswered import Unanswered
 from gateway.engine.results.health_rules import HealthRules, offline
+from gateway.engine.results.identities import wrong_device
 from gateway.engine.results.listening import ONLY_LISTENS, listens
 from gateway.engine.results.next_job import NextJob
 from gateway.engine.results.poll_rules import PollRules
@@ -115,8 +117,8 @@ class Engine:
             if (shapes := job.device.shapes) is not None:
                 if isinstance(job, Probe):
                     shapes.probed(job.outstanding, job.token, job.device.probe_spans, now)
-                elif isinstance(job, Answer):
-                    shapes.sent(None, now)
+                elif isinstance(job, Answer | Identify):
+                    shapes.sent(job.shape if isinstance(job, Identify) else None, now)
         in_flight.job, in_flight.begun = job, now
         return job
 
@@ -212,6 +214,8 @@ class Engine:
             self._effects.ended(request, LineDown(why))
         elif not (dials or self.schedule.reachable(device, now)):
             self._effects.ended(request, offline(device))
+        elif not (device.identity is None or device.identity.takes_requests):
+            self._effects.ended(request, wrong_device(device))
         elif not queue.submit(request):
             self._effects.ended(request, Busy(TOO_MANY.format(line=self.name)))
         self._set_deadline()

@@ -10,6 +10,7 @@ from gateway.engine.results.bit_writes import BitWrites
 from gateway.engine.results.broadcast_replies import BroadcastReplies
 from gateway.engine.results.busy_devices import BusyDevices
 from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.identities import Identities
 from gateway.engine.results.line_silence import LineSilence
 from gateway.engine.results.listening import Listening, listens
 from gateway.engine.results.pipelining import Pipelining
@@ -51,6 +52,7 @@ def rules_of(line: LineState) -> Sequence[Rule]:
         BusyDevices(),
         BroadcastReplies(devices),
         BitWrites(),
+        Identities(devices, line.schedule, line.in_flight, effects),
         Stray(line.name, devices, line.health, effects),
         RequestExpiry(line.schedule.requests, effects),
         line.staleness,

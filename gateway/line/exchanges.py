@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, cast
 from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
+    Identify,
     Poll,
     Probe,
     ReadBack,
@@ -96,6 +97,8 @@ def _what(job: Transacted) -> tuple[str, str]:
             return "read", f"read {describe(block)}"
         case Probe():
             return "probe", "probe"
+        case Identify():
+            return "probe", "identity"
         case Settle():
             return "wait", "wait for a late reply"
         case Answer():

@@ -1,7 +1,7 @@
 """Performs one job on an open transaction: calls the driver, and decides nothing."""
 
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -12,6 +12,8 @@ from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
+    Identified,
+    Identify,
     Poll,
     Probe,
     ReadBack,
@@ -33,7 +35,12 @@ from gateway.errors import (
 )
 from gateway.line.polling import RESULTS, read_poll
 from gateway.line.transaction import Transaction
-from gateway.protocols.capabilities import ChangesBits, Controllable, ScatteredWriter
+from gateway.protocols.capabilities import (
+    ChangesBits,
+    Controllable,
+    Identifies,
+    ScatteredWriter,
+)
 from gateway.protocols.driver import AnyDriver, Span, Talk
 
 T = TypeVar("T")
@@ -65,6 +72,8 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
     try:
         if isinstance(job, Poll):
             return await read_poll(job, transaction)
+        if isinstance(job, Identify):
+            return await _identify(job, transaction)
         return await _perform(job, transaction)
     except RESULTS as error:
         return error
@@ -97,6 +106,28 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             await transaction.tell(frame)
             return None
     raise TypeError(f"{job.device.name} cannot perform {job!r}")
+
+
+async def _identify(job: Identify, talk: Transaction) -> Identified:
+    device, told = job.device, dict[str, Sequence[str]]()
+    driver, tags = device.settings.driver, device.settings.identity_tags
+    names = device.settings.identity.keys() - {tag.name for tag in tags}
+    if names and isinstance(driver, Identifies):
+        told |= await driver.identify(talk, names)
+    if job.token is not None:
+        with _refused_is_unclear():
+            await driver.resync(talk, None, job.token, device.probe_spans)
+    for tag in tags:
+        told[tag.name] = (str(tag.decode(await driver.read(talk, tag.span))),)
+    return Identified(told)
+
+
+@contextmanager
+def _refused_is_unclear() -> Iterator[None]:
+    try:
+        yield
+    except Refused as error:
+        raise Unclear(f"its resync was refused too: {error}") from error
 
 
 async def _command(job: Command, driver: Any, transaction: Transaction) -> str:
@@ -254,10 +285,8 @@ async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:
 
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
     driver = job.device.driver
-    try:
+    with _refused_is_unclear():
         await driver.resync(talk, job.outstanding, job.token, job.device.probe_spans)
-    except Refused as error:
-        raise Unclear(f"its resync was refused too: {error}") from error
     if not any(verified(write.tag) for write in job.writes):
         return Sent()
     return Sent(held=await driver.read(talk, job.run))

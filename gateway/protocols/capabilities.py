@@ -3,7 +3,7 @@
 The callers ask with `isinstance`; a driver without the capability needs nothing for it.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
@@ -143,6 +143,21 @@ class Controllable(Protocol[F]):
 
     async def control(self, talk: Talk[F], command: str, argument: str) -> str:
         """Returns the reply of the device. Raises `BadValue` for an argument it cannot send."""
+
+
+@runtime_checkable
+class Identifies(Protocol[F]):
+    """A driver whose device tells which one it is."""
+
+    @property
+    def identity_names(self) -> Collection[str]:
+        """What it may tell: vendor, model, serial."""
+
+    async def identify(self, talk: Talk[F], names: Collection[str]) -> Mapping[str, Sequence[str]]:
+        """Returns all texts that the device tells for each of the names.
+
+        Raises `Refused` if it lacks the function.
+        """
 
 
 @runtime_checkable

@@ -25,6 +25,7 @@ class Reason(StrEnum):
     OVERDUE = "overdue"  # the device replies, but the last read of this tag is too old
     DISABLED = "disabled"  # `enabled: false` in the file
     NOT_A_NUMBER = "not-a-number"  # a good read, but no value of the tag's type (NaN, bad BCD)
+    WRONG_DEVICE = "wrong-device"  # the device that replies is not the one of the file
 
 
 class Sample(NamedTuple):

@@ -8,6 +8,7 @@ import pytest
 
 from gateway.engine.beliefs import BELIEFS, Belief, table
 from gateway.engine.device.health import FORGOTTEN, State
+from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
 from gateway.engine.device.probe_pace import PROBE_SPREAD
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.requests import Write
@@ -257,6 +258,20 @@ def changes_no_bits() -> Way:
     return lambda after: is_masked(HOUR + after)
 
 
+def silent_about_identity() -> Way:
+    identity = Identity({"vendor": "ABB"})
+    for _ in range(SILENT_TRIES):
+        identity.unanswered(HOUR)
+    assert identity.verdict is Verdict.UNTOLD
+    identity.doubt(HOUR + 60)
+    assert identity.is_usable
+
+    def given_up(after: float) -> bool:
+        return identity.due <= HOUR + after
+
+    return given_up
+
+
 def busy() -> Way:
     rule, device = BusyDevices(), link_device()
     poll = Poll(device, device.blocks[0], device.blocks[0].span)
@@ -358,6 +373,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "refuses a longer read": longer_read,
     "a bridge waits for a dead unit": bridge_waits,
     "does not change bits by itself": changes_no_bits,
+    "is silent about its identity": silent_about_identity,
     "a device is busy": busy,
     "a device is offline": offline,
     "a device that is never read does not answer": never_read,

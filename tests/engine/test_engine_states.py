@@ -18,6 +18,8 @@ from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
+    Identified,
+    Identify,
     Idle,
     Job,
     Poll,
@@ -67,6 +69,8 @@ RULES = [
     WriteRule(verify=True, repeat=True),
     WriteRule(latest=True),
 ]
+RESYNCED = (Resynced(0), Resynced(1))
+IDENTIFIED = (Identified({"vendor": ["ABB"]}), Identified({"vendor": ["another"]}))
 RESYNC = Probe | Settle | Confirm | Repeat  # what goes to a device that needs a resync
 
 
@@ -82,7 +86,9 @@ def devices() -> list[Device]:
     rtu_tags = [make_tag(f"holding:{n}", rtu, every=1.0, write=WriteRule()) for n in (1, 2, 900)]
     return [
         made_device("vigor", vigor, WIRE, vigor.timing, vigor_tags),
-        made_device("rtu", rtu, WIRE, rtu.timing, rtu_tags, verify_reads=2),
+        made_device(
+            "rtu", rtu, WIRE, rtu.timing, rtu_tags, verify_reads=2, identity={"vendor": "ABB"}
+        ),
         tcp_device(),
         broadcast_device(),
         link_device(station=5),
@@ -104,8 +110,8 @@ def possible(job: Transacted) -> list[Result]:
     match job:
         case Poll():
             return [[7] * job.span.size, Unsteady("differ"), *FAILED]
-        case Probe():
-            return [Resynced(0), Resynced(1), *FAILED]
+        case Probe() | Identify():
+            return [*(RESYNCED if isinstance(job, Probe) else IDENTIFIED), *FAILED]
         case Settle():
             return [Settled(None), Settled(0.1)]
         case Command():
@@ -199,6 +205,7 @@ class Machine(RuleBasedStateMachine):
                             [of] = [one for one in self.devices if sample.tag in one.tags]
                             assert self.engine.is_open
                             assert of.health.online
+                            assert of.identity is None or of.identity.is_usable
                             assert self.online[of], (
                                 "the device comes online before its first sample"
                             )
@@ -221,6 +228,8 @@ class Machine(RuleBasedStateMachine):
             self.in_order([one for one in requests_of(job) if isinstance(one, Write)])
         if waited[job.device]:
             assert isinstance(job, RESYNC)
+        if isinstance(job, Poll | Write | WriteTogether | Command):
+            assert job.device.identity is None or job.device.identity.is_usable
         if isinstance(job, Poll):
             [entry] = [e for e in self.engine.schedule.polls(job.device) if e.job is job]
             assert job.device.health.online

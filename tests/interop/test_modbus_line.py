@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.device.device import Device
+from gateway.errors import WrongDevice
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.tags import Quality, Reason, WriteRule
@@ -39,6 +40,10 @@ class RealPort(Bench):
         self.ear = ear
         self.inner = await open_port(self.where, SerialSettings(19200, "8N1"), self)
         return self
+
+    def lost(self, error: Exception) -> None:
+        if self.ear is not None:
+            self.ear.lost(error)
 
 
 @asynccontextmanager
@@ -203,6 +208,82 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
             await _write_group(line, device, [f"coil:{n}" for n in range(20)], 15)
         assert device.record.failures == {}
         assert device.record.exchanges > 10  # how many polls fit in depends on the machine
+
+
+def quality(line: Plant) -> Quality | Reason | None:
+    """Of its only tag; the reason of a bad one."""
+    sample = next(iter(line.now.values()), None)
+    return None if sample is None else sample.reason or sample.quality
+
+
+def meter(port: int, model: str) -> AbstractAsyncContextManager[object]:
+    """A pymodbus server that tells its model."""
+    command = (sys.executable, HERE / "pymodbus_server.py", "socket", "tcp", str(port))
+    return running(*command, "ABB", model, ready=b"ready")
+
+
+async def test_two_swapped_meters_are_bad_until_they_are_swapped_back() -> None:
+    models = ("A1", "B2")
+    ports = [free_port(), free_port()]
+    plants = []
+    for port, model in zip(ports, models, strict=True):
+        driver = ModbusTcp()
+        tags = (make_tag("holding:100", driver, every=0.05, write=WriteRule()),)
+        own = {"vendor": "ABB", "model": model}
+        device = made_device(model, driver, NETWORK, driver.timing, tags, identity=own)
+        where = TcpAddress("127.0.0.1", port)
+        plants.append(Plant([device], [], RealPort(where=where), NETWORK))
+
+    async with serving(plants[0]), serving(plants[1]):
+        for order, expected_ in (
+            (models, Quality.GOOD),
+            (models[::-1], Reason.WRONG_DEVICE),
+            (models, Quality.GOOD),
+        ):
+            one, other = (meter(*pair) for pair in zip(ports, order, strict=True))
+            async with one, other:
+                await until(lambda: all(quality(plant) is expected_ for plant in plants))  # noqa: B023
+                for plant in plants:
+                    device = plant.devices[0]
+                    writing = plant.line.write(device, device.tags[0], [7])
+                    if expected_ is Reason.WRONG_DEVICE:
+                        with pytest.raises(WrongDevice):
+                            await writing
+                    else:
+                        await writing
+            await until(lambda: all(quality(plant) is Reason.LINE_DOWN for plant in plants))
+
+
+@pytest.mark.usefixtures("socat")
+async def test_libmodbus_tells_its_serial_by_function_17_alone(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """It refuses function 43."""
+    async with libmodbus(tcp=False)(request, tmp_path) as where:
+        driver = ModbusRtu(station=1)
+        tags = (make_tag("holding:100", driver, every=0.05),)
+        identity = {"serial": "LMB0"}
+        device = made_device("peer", driver, SERIAL, driver.timing, tags, identity=identity)
+        line = Plant([device], [], RealPort(where=where), SERIAL)
+        async with serving(line):
+            await until(lambda: quality(line) is Reason.WRONG_DEVICE)
+        assert device.identity is not None
+        assert [word for word in device.identity.told["serial"] if word.startswith("LMB3")]
+
+
+@pytest.mark.usefixtures("socat")
+async def test_libmodbus_cannot_tell_its_vendor_and_is_read_all_the_same(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    async with libmodbus(tcp=False)(request, tmp_path) as where:
+        driver = ModbusRtu(station=1)
+        tags = (make_tag("holding:100", driver, every=0.05),)
+        identity = {"vendor": "ABB"}
+        device = made_device("peer", driver, SERIAL, driver.timing, tags, identity=identity)
+        line = Plant([device], [], RealPort(where=where), SERIAL)
+        async with serving(line):
+            await until(lambda: tags[0] in line.now and line.now[tags[0]].value == 100)
+        assert "cannot tell its identity" in device.diagnosis()
 
 
 @pytest.mark.usefixtures("socat")

@@ -408,6 +408,8 @@ async def test_the_model_is_reported_with_its_name() -> None:
     driver, peer = ComputerLink(), Peer(0, 1, True)
     talk = Script(driver, sends(peer.enq("00FFPC0")), hears(peer.stx("9D")))
     assert await driver.control(talk, "model", "") == "9D (FX2N)"
+    talk = Script(driver, sends(peer.enq("00FFPC0")), hears(peer.stx("9D")))
+    assert await driver.identify(talk, {"model"}) == {"model": ["9D", "FX2N"]}
 
 
 BOUNDARIES = [

@@ -13,6 +13,7 @@ from gateway.config.settings.modem_settings import ModemSection
 from gateway.config.settings.session_model import GatewaySection, Section, ZenohSection
 from gateway.config.settings.setting_types import (
     FORMAT_SCHEMA,
+    IDENTITY_SCHEMA,
     Baudrate,
     Duration,
     FilePath,
@@ -45,6 +46,8 @@ class DeviceSection(Section):
     """The number of equal reads in a row before a value counts."""
     late_guard: Duration | None = None
     """The longest wait for a late reply after a time-out, before the next request."""
+    identity: Annotated[dict[str, str], Parsed(parsers.identity, IDENTITY_SCHEMA)] = {}
+    """What the device must tell of itself: vendor, model, serial, or the value of a tag."""
     blocks: Annotated[
         bool | Literal["only"], Parsed(parsers.blocks, {"enum": [True, False, "only"]})
     ] = False

@@ -242,6 +242,16 @@ def blocks(value: object) -> bool | Literal["only"]:
     raise ConfigError(f"{shown(value)} is not known: use true, false or only")
 
 
+def identity(value: object) -> dict[str, str]:
+    """Parses `{vendor: ABB, serial: "1234"}`."""
+    if not isinstance(value, dict) or not value:
+        raise ConfigError(f'{shown(value)}: write what it tells, such as {{serial: "1234"}}')
+    for name, text in value.items():
+        if not isinstance(text, str) or not text.strip():
+            raise ConfigError(f"{name}: {shown(text)} is no text: write numbers in quotes")
+    return {str(name): text.strip() for name, text in value.items()}
+
+
 def path(text: object) -> Path:
     if not isinstance(text, str) or not text.strip() or not is_name(text):
         raise ConfigError(f"{shown(text)} is no file name")

@@ -70,6 +70,7 @@ TYPE_SCHEMA = {
         {"type": "string", "pattern": rf"^({_ARRAYS})\[0*([1-9][0-9]{{0,2}}|1[0-9]{{3}}|2000)\]$"},
     ]
 }
+IDENTITY_SCHEMA = {"type": "object", "additionalProperties": {"type": "string"}, "minProperties": 1}
 SCALE_SCHEMA = {"type": "number", "not": {"const": 0}}
 _ENDPOINT_SCHEMA = {
     "type": "string",

@@ -22,7 +22,15 @@ from gateway.values import Kind
 _TELEPHONE = 2.0  # seconds: modems repeat what the line has damaged
 _OF_DEVICES = ("accept", "stale_after")
 _OF_TAGS = ("source", "retain", "hold_last")
-_OF_MASTERS = ("reply_timeout", "retries", "verify_reads", "late_guard", "silence", "control")
+_OF_MASTERS = (
+    "reply_timeout",
+    "retries",
+    "verify_reads",
+    "late_guard",
+    "silence",
+    "control",
+    "identity",
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from dataclasses import InitVar, dataclass, field
 
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.device.health import Health, State, diagnosis
+from gateway.engine.device.identity import Identity
 from gateway.engine.device.monitor_list import MonitorList
 from gateway.engine.device.records import Record
 from gateway.engine.device.reply_shapes import ReplyShapes, reply_shapes
@@ -50,6 +51,7 @@ class Device:
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: StationSilence = field(init=False)
     shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
+    identity: Identity | None = field(init=False)  # None: the file says nothing of it
     one_at_a_time: bool = False  # it loses requests that are sent together
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
@@ -63,6 +65,7 @@ class Device:
         answers = self.settings.answerable
         written = answers and bool(self.tags) and not any(tag.polled for tag in self.tags)
         self.health = Health(answerable=answers, only_written=written)
+        self.identity = Identity(self.settings.identity) if self.settings.identity else None
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
@@ -130,6 +133,8 @@ class Device:
         driver = self.driver
         trouble = self.health.trouble
         if trouble is None:
+            if self.identity is not None and self.identity.why:
+                return self.identity.why
             if self.shapes is not None and self.shapes.answers_twice:
                 return ANSWERS_TWICE.format(station=driver.station)
             if self.one_at_a_time:
@@ -161,6 +166,8 @@ class Device:
         self.health, self.record, self.use = old.health, old.record, old.use
         self.health.resyncs_elsewhere()
         self.last_read, self.one_at_a_time = old.last_read, old.one_at_a_time
+        if self.settings.identity == old.settings.identity:
+            self.identity = old.identity
         if (old.silence.safe, old.silence.least) == (self.silence.safe, self.silence.least):
             self.silence = old.silence
         if self.shapes is not None and old.shapes is not None:

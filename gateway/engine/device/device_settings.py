@@ -1,5 +1,6 @@
 """One station on a line, as the file describes it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,6 +18,7 @@ class DeviceSettings:
     timing: Timing  # the defaults of the protocol, with the settings of the file
     turnaround: float | None = None  # None: measured
     late_guard: float = 0.5  # the longest wait for a late reply after a time-out
+    identity: Mapping[str, str] = field(default_factory=dict)  # by name: of the driver, or a tag
     verify_reads: int = 1  # reads in a row that must agree
     blocks: bool | Literal["only"] = False  # one put per scan: also, or instead of one per tag
     control: bool = False  # run, stop, ... are allowed
@@ -31,6 +33,11 @@ class DeviceSettings:
         tags = [tag for tag in self.tags if tag.origin.formula is None]
         found = tuple(tag if tag.origin.kept is None else tag.origin.inputs[0] for tag in tags)
         object.__setattr__(self, "wire_tags", found)
+
+    @property
+    def identity_tags(self) -> list[Tag]:
+        """The tags whose values show which device it is."""
+        return [tag for tag in self.wire_tags if tag.name in self.identity]
 
     @property
     def answerable(self) -> bool:

@@ -107,6 +107,10 @@ class ReplyShapes:
         self._used[shape] = now
         self._sent(shape, now)
 
+    def of(self, span: Span) -> Hashable:
+        """Returns the shape of the reply to a read of the span."""
+        return self._driver.reply_shape(span)
+
     def probed(
         self, outstanding: Span | None, token: int, spans: Sequence[Span], now: float
     ) -> None:

@@ -1,7 +1,7 @@
 """Jobs that an engine hands to its line, and their results."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gateway.engine.device.device import Device
@@ -31,6 +31,15 @@ class Probe:
     token: int
     again: bool = False  # the line has settled: any reply belongs to this probe
     timeout: float | None = None  # of a short probe; None: `reply_timeout` of the device
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identify:
+    """A job: ask a device which one it is."""
+
+    device: Device
+    token: int | None = None  # of the resync before its tags are read; None: no reply is mistaken
+    shape: Hashable = None  # of the last reply, if it is known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +101,7 @@ class Answer:
 
 
 RequestJob = Write | WriteTogether | ReadBack | Command | Confirm | Repeat
-Unfinished = Poll | Probe | RequestJob
+Unfinished = Poll | Probe | Identify | RequestJob
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,6 +195,13 @@ class Resynced:
 
 
 @dataclass(frozen=True, slots=True)
+class Identified:
+    """The texts that a device told of itself, by the names of `identity`."""
+
+    told: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
 class Sent:
     """A write was acknowledged, or sent to stations that never acknowledge."""
 
@@ -213,5 +229,5 @@ class Settled:
     quiet: bool = True
 
 
-Success = Sequence[int] | Resynced | Sent | HeldTogether | Settled | str | None
+Success = Sequence[int] | Resynced | Identified | Sent | HeldTogether | Settled | str | None
 Result = Success | DeviceError | BadValue | LineDown | Busy

@@ -5,6 +5,8 @@ from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
+    Identified,
+    Identify,
     Poll,
     Probe,
     ReadBack,
@@ -102,6 +104,8 @@ class NextJob:
                 self._settled(job, result, now, time)
             case Probe():
                 self._probed(job, result, traffic, now, time)
+            case Identify():
+                self._identified(job, result, traffic, now, time)
             case Answer():
                 if isinstance(result, Garbled):
                     why = str(result)
@@ -136,6 +140,17 @@ class NextJob:
                 device.health.left_outstanding(None, now)
             case BadValue():
                 raise result
+
+    def _identified(
+        self, job: Identify, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        match result:
+            case Identified() | Refused():
+                self._results.answered(job.device, now, time)
+            case Unclear():
+                self.unclear(job, result, traffic, now, time)
+            case LineDown():
+                job.device.health.left_outstanding(None, now)
 
     def _requested(
         self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
@@ -180,7 +195,9 @@ class NextJob:
         took = now - self._in_flight.begun
         failed = self._in_flight.failed  # in the same transaction
         alone = len(failed) == 1
-        suspect = alone and isinstance(after, Poll) and _is_suspect(after)
+        suspect = isinstance(after, Identify) or (
+            alone and isinstance(after, Poll) and _is_suspect(after)
+        )
         self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )

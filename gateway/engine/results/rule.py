@@ -5,7 +5,17 @@ from typing import Any, Protocol
 
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import Answer, Idle, Job, Poll, Reopen, Result, Traffic, Transacted
+from gateway.engine.jobs.jobs import (
+    Answer,
+    Identify,
+    Idle,
+    Job,
+    Poll,
+    Reopen,
+    Result,
+    Traffic,
+    Transacted,
+)
 
 NEVER = float("inf")
 
@@ -28,7 +38,7 @@ class Rule(Protocol):
         """False if it has nothing to say about these devices: then it is asked nothing else."""
         return True
 
-    def first(self, now: float) -> Answer | Idle | Reopen | None:
+    def first(self, now: float) -> Answer | Identify | Idle | Reopen | None:
         """Returns a job that precedes all others."""
         return None
 
@@ -127,7 +137,7 @@ class Rules:
         (self.troubled.discard if good else self.troubled.add)(device)
         return self.concluded
 
-    def preceding(self, now: float) -> Answer | Idle | Reopen | None:
+    def preceding(self, now: float) -> Answer | Identify | Idle | Reopen | None:
         """Returns the job that precedes all others, if any."""
         for first in self.first:
             if (job := first(now)) is not None:

@@ -74,6 +74,7 @@ def _station(station: Station, now: float) -> Document:
         "served": True,
         "standing": station.presence.value,
         "diagnosis": station.diagnosis(),
+        "identity": None,
         "exchanges": counts.requests,
         "writes": counts.writes,
         "slowest_write": 0.0,

@@ -129,6 +129,7 @@ SCHEMAS: Mapping[str, Schema] = {
                 "protocol": TEXT,
                 "standing": choice("starting", "up", "failing", "silent"),
                 "diagnosis": _about(TEXT, "Likely cause of a fault, as a sentence"),
+                "identity": _about(_OBJECT_OR_NULL, "What it told of itself; null: not asked"),
             },
             more=True,
         ),

@@ -3,7 +3,8 @@
 Liyan Computer Link manual (Lylink-edoc0307), section numbers below are its own.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, TypeVar
 
@@ -241,6 +242,13 @@ class ComputerLink:
             raise BadValue(f"global takes on or off, not {argument!r}")
         await talk.tell(self._enquiry("GW", _SWITCH[argument.lower()], ALL_STATIONS))
         return "sent to all stations, none answers"
+
+    identity_names: ClassVar = ("model",)
+
+    async def identify(self, talk: LinkTalk, names: Collection[str]) -> Mapping[str, Sequence[str]]:
+        """Asks for the model by PC: its code, and its name if that is known."""
+        told = await self._ask_text(talk, "PC", "", 2, model_name)
+        return {"model": re.findall(r"\w+", told)}
 
     async def resync(
         self,

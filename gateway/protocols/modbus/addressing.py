@@ -51,7 +51,7 @@ class Dialect:
     ascii_limits: Limits = Limits()  # noqa: RUF009 - an immutable tuple
     single_writes: bool = True  # functions 05 and 06 are served
     rtu_silence: float = 0.0  # seconds, where the device needs more than the standard
-    masks: bool = False  # it may have function 22
+    standard: bool = False  # it may have functions 17, 22 and 43
     forgets_address: bool = False  # replies to function 06 may have address 0
 
     def named(self, table: str, number: int) -> str:
@@ -138,8 +138,8 @@ def _spell_modicon(address: Address) -> str:
     return f"{digit}{number:04d}{_suffix(address)}"
 
 
-PLAIN = Dialect(_PLAIN, _plain, _spell_plain, masks=True)
-MODICON = Dialect(_PLAIN, _modicon, _spell_modicon, masks=True)
+PLAIN = Dialect(_PLAIN, _plain, _spell_plain, standard=True)
+MODICON = Dialect(_PLAIN, _modicon, _spell_modicon, standard=True)
 
 # ---- EX485LNK: raw registers, 32 words, 10 ms of silence (manual 2.4, 2.5) ---------------
 

@@ -1,6 +1,6 @@
 """The Modbus drivers: RTU, ASCII and TCP, each a list of settings over the same master."""
 
-from collections.abc import Coroutine, Hashable, Mapping, Sequence
+from collections.abc import Collection, Coroutine, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -101,6 +101,15 @@ class _Modbus:
         self, talk: Talk[Frame], span: Span, mask: int, bits: int
     ) -> Coroutine[Any, Any, bool]:
         return self._master.change_bits(talk, span, mask, bits)
+
+    @property
+    def identity_names(self) -> Collection[str]:
+        return self._master.identity_names
+
+    def identify(
+        self, talk: Talk[Frame], names: Collection[str]
+    ) -> Coroutine[Any, Any, Mapping[str, Sequence[str]]]:
+        return self._master.identify(talk, names)
 
     def resync(
         self,

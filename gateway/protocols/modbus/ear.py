@@ -16,6 +16,7 @@ from gateway.protocols.modbus.frame import (
     MASK_WRITE,
     READ_BITS,
     READ_WORDS,
+    REPORT_ID,
     WRITE_MANY,
     WRITE_SINGLE,
     answer_length,
@@ -24,7 +25,7 @@ from gateway.protocols.modbus.mbap import MbapCodec
 from gateway.protocols.modbus.rtu import is_sound
 
 _READS = (*READ_BITS, *READ_WORDS)
-_READ_AND_WRITE, _REPORT_ID = 23, 17
+_READ_AND_WRITE = 23
 _ECHOED = (*WRITE_SINGLE, DIAGNOSTICS, MASK_WRITE)  # the good reply is equal to the request
 _MOST = {1: 2000, 2: 2000, 3: 125, 4: 125}  # units of a read
 
@@ -32,7 +33,7 @@ _MOST = {1: 2000, 2: 2000, 3: 125, 4: 125}  # units of a read
 _REQUESTS = {**dict.fromkeys((*_READS, *WRITE_SINGLE, DIAGNOSTICS), 5), 7: 1, 11: 1, 17: 1, 22: 7}
 _COUNTED_REQUESTS = {**dict.fromkeys(WRITE_MANY, 5), _READ_AND_WRITE: 9}
 _REPLIES = {**dict.fromkeys((*WRITE_SINGLE, *WRITE_MANY, DIAGNOSTICS), 5), 7: 2, 11: 5, 22: 7}
-_COUNTED_REPLIES = dict.fromkeys((*_READS, _REPORT_ID, _READ_AND_WRITE), 1)
+_COUNTED_REPLIES = dict.fromkeys((*_READS, REPORT_ID, _READ_AND_WRITE), 1)
 
 _BROKEN = 0.2  # seconds; a frame without end does not wait for the next one
 _FRAME_GAP = 3.5  # characters

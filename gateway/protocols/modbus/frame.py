@@ -17,6 +17,7 @@ WRITE_SINGLE = (5, 6)
 WRITE_MANY = (15, 16)
 DIAGNOSTICS = 8
 MASK_WRITE = 22
+REPORT_ID, READ_IDENTITY = 17, 43
 EXCEPTION = 0x80  # added to the function code of the request
 
 

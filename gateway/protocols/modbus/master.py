@@ -1,9 +1,17 @@
 """The master's side of Modbus: requests to one device and their replies, without framing."""
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Coroutine,
+    Hashable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass, field, replace
 from itertools import count, repeat
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Refused, Took
 from gateway.protocols.driver import EVERY_REQUEST, Area, Cost, Span, Talk, Unit
@@ -12,7 +20,9 @@ from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Dialect, Limits, Place
 from gateway.protocols.modbus.ear import Read
 from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
+from gateway.protocols.modbus.identity import NAMES, identify
 
+T = TypeVar("T")
 _REMEMBERED = 1024  # spans whose request is kept ready
 _FEWEST_SIZES, _MOST_SIZES = 4, 16  # of the reads that a resync may send
 
@@ -155,7 +165,7 @@ class Master:
         """True for a register of a device whose manual does not say that it lacks function 22."""
         place = self._place(span)
         own = place is not None and place.function == 3 and place.area.writable
-        return own and self.dialect.masks and not self.broadcast
+        return own and self.dialect.standard and not self.broadcast
 
     async def change_bits(self, talk: Talk[Frame], span: Span, mask: int, bits: int) -> bool:
         wire = self.dialect.places[span.area].at(span.start)
@@ -310,17 +320,33 @@ class Master:
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)
+        await self.ask(talk, request, 5, lambda heard: heard == request or None)
+
+    async def ask(
+        self, talk: Talk[Frame], request: bytes, longest: int, accept: Callable[[bytes], T | None]
+    ) -> T:
+        """Sends a request. `accept` returns the contents of its reply of at most `longest` bytes,
+        or None for another frame."""
         number = next(self._numbers) & 0xFFFF
 
-        def answers(heard: Frame) -> bool | None:
+        def answers(heard: Frame) -> T | None:
             if heard.station != self.station or heard.transaction != number:
                 return None
-            if heard.pdu == request:
-                return True
+            if (found := accept(heard.pdu)) is not None:
+                return found
             pdu.raise_refusal(heard.pdu, request[0])
             return None
 
-        await talk.ask(Frame(self.station, request, number), self.chars(5), answers)
+        return await talk.ask(Frame(self.station, request, number), self.chars(longest), answers)
+
+    @property
+    def identity_names(self) -> Collection[str]:
+        return NAMES if self.dialect.standard and not self.broadcast else ()
+
+    def identify(
+        self, talk: Talk[Frame], names: Collection[str]
+    ) -> Coroutine[Any, Any, Mapping[str, Sequence[str]]]:
+        return identify(self.ask, talk, names)
 
 
 def _is_bits(place: Place) -> bool:

@@ -112,6 +112,16 @@ def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
     return [word for low, high in pairs for word in ((low, high) if low_first else (high, low))]
 
 
+def objects_in(reply: bytes) -> dict[int, str] | None:
+    """Returns the objects in a reply to function 43; None for another frame."""
+    objects, at = dict[int, str](), 7
+    while at + 2 <= len(reply):
+        number, end = reply[at], at + 2 + reply[at + 1]
+        objects[number] = reply[at + 2 : end].decode("latin-1")
+        at = end
+    return objects if at == len(reply) and len(objects) == reply[6] else None
+
+
 _ACCEPTED = 5
 _WRITES = (*WRITE_SINGLE, *WRITE_MANY, MASK_WRITE)
 _NOT_DONE = (1, 2, 3, 6, 10)  # exceptions without any effect

@@ -11,7 +11,9 @@ from gateway.protocols.modbus.frame import (
     EXCEPTION,
     MASK_WRITE,
     READ_BITS,
+    READ_IDENTITY,
     READ_WORDS,
+    REPORT_ID,
     WRITE_MANY,
     WRITE_SINGLE,
     Frame,
@@ -20,10 +22,12 @@ from gateway.protocols.modbus.frame import (
 
 _WRAPPING = 3  # characters around the PDU: station and CRC
 _SHORTEST = 5  # an exception
+_LONGEST = 256
 _KEPT = 520  # no frame is longer than 260; bytes before the last two frames are noise
 _FIXED = (*WRITE_SINGLE, *WRITE_MANY, DIAGNOSTICS)
 _ECHOED = (*WRITE_SINGLE, DIAGNOSTICS, MASK_WRITE)  # the good reply is equal to the request
 _KNOWN = (*READ_BITS, *READ_WORDS, *_FIXED, MASK_WRITE)
+_REPLIED = (*_KNOWN, REPORT_ID, READ_IDENTITY)  # by a device that has them
 
 
 def chars(pdu_length: int) -> int:
@@ -115,9 +119,19 @@ def _reply_size(heard: bytes | bytearray, start: int) -> int:
         return 10
     if function in READ_WORDS:
         return 5 + third if third and third % 2 == 0 else 0
-    if function in READ_BITS:
+    if function in (*READ_BITS, REPORT_ID):
         return 5 + third if third else 0
-    return _SHORTEST if function & EXCEPTION and function - EXCEPTION in _KNOWN else 0
+    if function == READ_IDENTITY:
+        return _identity_size(heard[start : start + _LONGEST])
+    return _SHORTEST if function & EXCEPTION and function - EXCEPTION in _REPLIED else 0
+
+
+def _identity_size(heard: bytes | bytearray) -> int:
+    """Returns the length of a reply to function 43, or, while it is not known, a lower limit."""
+    size = 8  # station, function, MEI type, level, conformity, more, next object, their number
+    for _ in range(heard[7] if len(heard) > 7 else 0):
+        size += 2 + (heard[size + 1] if len(heard) > size + 1 else 0)
+    return size + 2
 
 
 class RtuSlaveCodec:
