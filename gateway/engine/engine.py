@@ -108,7 +108,8 @@ class Engine:
             in_flight.open[job.job] = job
             job = job.job
         elif isinstance(job, Idle):
-            wakes = [wake(now) for wake in rules.wake] if rules.troubled else ()
+            asked = rules.troubled or rules.asked_always
+            wakes = [wake(now) for wake in rules.wake] if asked else ()
             return Idle(min(job.until, *wakes)) if wakes else job
         elif isinstance(job, Reopen):
             return job

@@ -258,7 +258,7 @@ async def test_two_swapped_meters_are_bad_until_they_are_swapped_back() -> None:
 async def test_libmodbus_tells_its_serial_by_function_17_alone(
     request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    """It refuses function 43."""
+    """It is silent about function 43."""
     async with libmodbus(tcp=False)(request, tmp_path) as where:
         driver = ModbusRtu(station=1)
         tags = (make_tag("holding:100", driver, every=0.05),)
@@ -283,7 +283,7 @@ async def test_libmodbus_cannot_tell_its_vendor_and_is_read_all_the_same(
         line = Plant([device], [], RealPort(where=where), SERIAL)
         async with serving(line):
             await until(lambda: tags[0] in line.now and line.now[tags[0]].value == 100)
-        assert "cannot tell its identity" in device.diagnosis()
+        assert "silent about its identity" in device.diagnosis()
 
 
 @pytest.mark.usefixtures("socat")

@@ -65,7 +65,7 @@ async def test_a_serial_number_is_any_word_that_the_device_tells(kind: Any) -> N
     driver = kind(station=1)
     replies = [told(3, EXTENDED), server_id(b"Pump 77-B")]
     talk = each(driver, [framed(kind, body, n) for n, body in enumerate(replies, 1)])
-    found = await driver.identify(talk, {"serial"})
+    found = await driver.identify(talk, {"vendor", "serial"})
     assert {"0012345", "77-B"} <= set(found["serial"])
     assert not {"12345", "001234", "77"} & set(found["serial"])
     request = ReportDeviceIdRequest()
@@ -75,14 +75,16 @@ async def test_a_serial_number_is_any_word_that_the_device_tells(kind: Any) -> N
 @pytest.mark.parametrize("kind", KINDS)
 async def test_function_17_is_enough_for_a_serial_number(kind: Any) -> None:
     driver = kind(station=1)
-    replies = [bytes.fromhex("ab 01"), server_id(b"Pump 77-B")]
-    talk = each(driver, [framed(kind, body, n) for n, body in enumerate(replies, 1)])
+    talk = each(driver, [framed(kind, server_id(b"Pump 77-B"), 1)])
     assert "77-B" in (await driver.identify(talk, {"serial"}))["serial"]
-    refusals = [framed(kind, bytes.fromhex(text), n) for n, text in ((3, "ab 01"), (4, "91 01"))]
+    replies = [bytes.fromhex("91 01"), told(3, EXTENDED)]
+    talk = each(driver, [framed(kind, body, n) for n, body in enumerate(replies, 2)])
+    assert "0012345" in (await driver.identify(talk, {"serial"}))["serial"]
+    refusals = [framed(kind, bytes.fromhex(text), n) for n, text in ((4, "91 01"), (5, "ab 01"))]
     with pytest.raises(Refused):
         await driver.identify(each(driver, refusals), {"serial"})
     with pytest.raises(Refused):
-        await driver.identify(each(driver, [framed(kind, bytes.fromhex("ab 01"), 5)]), {"vendor"})
+        await driver.identify(each(driver, [framed(kind, bytes.fromhex("ab 01"), 6)]), {"vendor"})
 
 
 async def test_objects_may_come_in_several_replies() -> None:

@@ -102,6 +102,11 @@ class Device:
         return self.health.state
 
     @property
+    def is_known(self) -> bool:
+        """False while it is not certain that it is the device of the file."""
+        return self.identity is None or self.identity.is_usable
+
+    @property
     def polled_tags(self) -> list[Tag]:
         """The tags that polls read."""
         areas = self.driver.areas

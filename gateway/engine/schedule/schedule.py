@@ -294,8 +294,11 @@ class Schedule:
         return [other.hand_out(now) for other in self._queue.more(device, most)]
 
     def _first_without_resync(self) -> PollEntry | None:
-        """Returns the due poll with the earliest deadline whose device needs no resync."""
-        ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
+        """Returns the due poll with the earliest deadline whose device needs no resync, and is
+        the one of the file."""
+        devices = {poll.device for poll in self._queue.valid()}
+        good = {one for one in devices if one.is_known and not one.health.needs_resync}
+        ready = (poll for poll in self._queue.valid() if poll.device in good)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
     # Results

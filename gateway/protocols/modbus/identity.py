@@ -35,17 +35,15 @@ async def identify(
     if _SERIAL not in names:
         return _by_name(await _objects(ask, talk, level))
     objects, texts = dict[int, str](), list[str]()
-    try:
+    only = set(names) == {_SERIAL}  # many devices have function 17 alone, and are silent about 43
+    if not only:
         objects = await _objects(ask, talk, _EXTENDED)
-    except Refused:
-        if set(names) != {_SERIAL}:
-            raise
     try:
         data: bytes = await ask(talk, bytes((REPORT_ID,)), _LONGEST, _server_id)
         texts = [data.hex().upper(), data.decode("latin-1")]
     except Refused:
-        if not objects:
-            raise
+        if only:
+            objects = await _objects(ask, talk, _EXTENDED)
     words = [word for text in (*objects.values(), *texts) for word in _WORD.findall(text)]
     return {**_by_name(objects), _SERIAL: words}
 
