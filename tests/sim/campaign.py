@@ -18,13 +18,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from tests.sim import north
+from tests.sim import liveness, north
 from tests.sim.draw import PACES
 from tests.sim.north_clients import GROUPS
 from tests.sim.story import Story
 from tests.sim.world import run
 
-NORTH = "north"  # the pace of the world of `north.py`
+NORTH, LIVENESS = "north", "liveness"  # paces of the worlds of `north.py` and `liveness.py`
 MOST = ("most timers", "most open")  # counts of which the largest is printed
 WORDS = ("frames", "good samples", "foreign answers")  # counts in the total
 NORTH_WORDS = ("published", "received", "lost by congestion", "answers", "pages", "executed")
@@ -86,7 +86,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=seeds, default=seeds("0-19"), metavar="0-19")
     parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--pace", choices=sorted([*PACES, NORTH, GROUPS]), default="busy")
+    parser.add_argument("--pace", choices=sorted([*PACES, NORTH, GROUPS, LIVENESS]), default="busy")
     parser.add_argument("--only", default="", help="kinds of faults, with commas")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     parser.add_argument("--part", type=part, default=(1, 1), metavar="1/4")
@@ -108,7 +108,8 @@ def main() -> int:
     began = time.monotonic()
     gc.set_threshold(100_000)
     with multiprocessing.Pool(chosen.workers, maxtasksperchild=20) as pool:
-        run_one = north.run if chosen.pace in (NORTH, GROUPS) else run
+        others = {NORTH: north.run, GROUPS: north.run, LIVENESS: liveness.run}
+        run_one = others.get(chosen.pace, run)
         task = partial(run_one, hours=chosen.hours, pace=chosen.pace, only=only, traced=False)
         for story in pool.imap_unordered(task, left):
             known.append(story)
