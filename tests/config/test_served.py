@@ -109,3 +109,19 @@ def test_settings_of_served_lines_are_refused_elsewhere() -> None:
     )
     for setting in ("retain", "source", "accept", "stale_after"):
         assert f"{setting} is a setting of served lines" in said
+
+
+@pytest.mark.parametrize(
+    ("identity", "said"),
+    [
+        ({"vendr": "ABB"}, "does not tell vendr: name a tag of it that is read"),
+        ({"command": "1"}, "does not tell command"),
+        ({"serial": 1234}, "1234 is no text: write numbers in quotes"),
+    ],
+)
+def test_an_identity_that_the_device_cannot_tell(identity: dict[str, Any], said: str) -> None:
+    tags = {"command": {"address": "holding:1", "write": True, "poll": False}}
+    drive = {"protocol": "modbus-rtu", "station": 4, "identity": identity, "tags": tags}
+    with pytest.raises(ConfigErrors) as raised:
+        built({"lines": {"hall": {"port": "/dev/ttyS1", "devices": {"drive": drive}}}})
+    assert said in str(raised.value)
