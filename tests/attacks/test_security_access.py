@@ -186,6 +186,7 @@ async def reads(person: ZenohPeer, rights: Rights) -> None:
         ("plant/**/@meta", VALUES),
         ("plant/*/@block", 1),
         ("plant/@gateway/demo/lines/*", 2),
+        (f"{STATUS[:-6]}audit/*?_time=[now(-1h)..]", 0),  # the file keeps none
         (f"{ALARMS}/**", 5),  # of a tag, two devices and two lines
         ("plant/mixer/speed?max_age=1h", 1),
         ("**", 0),
@@ -232,6 +233,7 @@ async def asks(person: ZenohPeer, rights: Rights, value: bytes) -> None:
     """Writes and commands on every key. The gateway answers the allowed ones."""
     group = group_of(value)
     requests = {RECIPE: value, DIAL: value, GROUP: group, LOOPBACK: b"AB", GLOBAL: b"on"}
+    requests["plant/mixer/@peek"] = b"D100"  # the page allows it to nobody
     for key, data in requests.items():
         replies = await person.get(key, data, target="ALL")
         assert [reply.ok for reply in replies] == ([True] if key in rights.writes else []), key
