@@ -4,9 +4,10 @@ A device may be silent about addresses that it lacks. So a resync reads inside t
 caller names, and each resync in another place and with another form of its reply.
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Awaitable, Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 
+from gateway.errors import Refused
 from gateway.protocols.driver import Span
 
 MOST_UNITS, MOST_FORMS = 64, 6  # of one read; of the reads in one place
@@ -31,6 +32,29 @@ def told_from(
             break
         found += 1
     return found
+
+
+async def resync_by_reads(
+    read: Callable[[Span], Awaitable[object]],
+    token: int,
+    outstanding: Span | None,
+    pick: Callable[[int], Span],
+    form: FormOf,
+) -> int:
+    """Sends the read of the token. Returns the number of requests that its reply is told from.
+
+    An error reply names no request: it may be the late reply to the `outstanding` read. So one
+    more read with another form follows it. Raises `Refused` where there is none.
+    """
+    sent, other = pick(token), pick(token + 1)
+    try:
+        await read(sent)
+    except Refused:
+        if form(sent) == form(other):
+            raise
+        await read(other)
+        sent = other
+    return told_from(sent, token, outstanding, pick, form)
 
 
 @dataclass(slots=True)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, TypeVar
 
-from gateway.errors import BadValue, ConfigError, Refused, Unclear
+from gateway.errors import BadValue, ConfigError, Unclear
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.computer_link.access import Access, possible, read_access, write_access
 from gateway.protocols.computer_link.codec import (
@@ -41,7 +41,7 @@ from gateway.protocols.computer_link.scattered import (
 )
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import EVERY_REQUEST, Address, Area, Cost, Span, Talk, Timing, Traits
-from gateway.protocols.harmless import HarmlessReads, told_from
+from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.listening import Ear, Learn
 
 LinkTalk = Talk[Frame]
@@ -270,7 +270,12 @@ class ComputerLink:
                 await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
                 told = EVERY_REQUEST
             else:
-                told = await self._resync_by_read(talk, outstanding, probe_token, reads)
+                told = await resync_by_reads(
+                    lambda span: self.read(talk, span),
+                    *(probe_token, outstanding, reads.pick, self.reply_shape),
+                )
+                if self.monitor:  # the length of the reply to a list is not known here
+                    told = 0
         except Unclear:
             self._kind.unanswered(loopback=loopback)
             raise
@@ -287,21 +292,6 @@ class ComputerLink:
             last = self.areas[area].last
             wider.append(Span(area, max(min(start, last - _WIDER + 1), 0), max(size, _WIDER)))
         return HarmlessReads(wider, outstanding, self.reply_shape)
-
-    async def _resync_by_read(
-        self, talk: LinkTalk, outstanding: Span | None, token: int, reads: HarmlessReads
-    ) -> int:
-        first, second = reads.pick(token), reads.pick(token + 1)
-        try:
-            await self.read(talk, first)
-        except Refused:
-            if self.reply_shape(first) == self.reply_shape(second):
-                raise
-            await self.read(talk, second)
-            first = second
-        if self.monitor:  # the length of the reply to a list is not known here
-            return 0
-        return told_from(first, token, outstanding, reads.pick, self.reply_shape)
 
     # Listening to another master
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from gateway.errors import ConfigError
 from gateway.protocols.devices import DeviceTable, parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Unit
+from gateway.protocols.modbus.frame import READ_BITS
 
 
 class Place(NamedTuple):
@@ -24,6 +25,10 @@ class Place(NamedTuple):
     def registers(self) -> int:
         """Wire addresses per unit."""
         return 2 if self.area.unit is Unit.DWORD else 1
+
+    @property
+    def of_bits(self) -> bool:
+        return self.function in READ_BITS
 
     def at(self, number: int) -> int:
         return self.wire + (number - self.area.first) * self.registers

@@ -9,18 +9,19 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import count, repeat
 from typing import Any, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Refused, Took
-from gateway.protocols.driver import EVERY_REQUEST, Area, Cost, Span, Talk, Unit
-from gateway.protocols.harmless import HarmlessReads, told_from
+from gateway.protocols.driver import EVERY_REQUEST, Span, Talk, Unit
+from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.modbus import pdu
-from gateway.protocols.modbus.addressing import Dialect, Limits, Place
+from gateway.protocols.modbus.addressing import Place
 from gateway.protocols.modbus.ear import Read
-from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
+from gateway.protocols.modbus.frame import Frame, answer_length
 from gateway.protocols.modbus.identity import NAMES, identify
+from gateway.protocols.modbus.settings import Settings
 
 T = TypeVar("T")
 _REMEMBERED = 1024  # spans whose request is kept ready
@@ -38,65 +39,16 @@ class ReadRequest(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Master:
-    """One device as its settings describe it."""
+class Master(Settings):
+    """The requests to one device."""
 
-    station: int
-    chars: Callable[[int], int]  # of a frame, by the length of its PDU
-    dialect: Dialect
-    limits: Limits
-    write_single: bool
-    diagnostics: bool
-    low_first: bool
-    broadcast: bool = False  # every device listens, none replies
-    numbered: bool = False  # requests carry a number
-    areas: Mapping[str, Area] = field(init=False)
-    _numbers: Iterator[int] = field(init=False)
-    _prepared: dict[Span, ReadRequest] = field(init=False, default_factory=dict)
+    _numbers: Iterator[int] = field(init=False, repr=False, compare=False)
+    _prepared: dict[Span, ReadRequest] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        numbers = count(1) if self.numbered else repeat(0)
-        object.__setattr__(self, "_numbers", numbers)
-        areas = [place.area for place in self.dialect.places.values()]
-        if self.broadcast:
-            areas = [replace(area, readable=False) for area in areas if area.writable]
-        object.__setattr__(self, "areas", {area.name: area for area in areas})
-
-    def cost(self, span: Span) -> Cost | None:
-        place = self._place(span)
-        if place is None or self.broadcast:
-            return None
-        if span.size * place.registers > self._most(place, reading=True):
-            return None
-        data = (span.size + 7) // 8 if _is_bits(place) else 2 * span.size * place.registers
-        return Cost(self.chars(5), self.chars(2 + data))
-
-    def write_cost(self, span: Span) -> Cost | None:
-        place = self._place(span)
-        if place is None or not place.area.writable:
-            return None
-        if span.size * place.registers > self._most(place, reading=False):
-            return None
-        data = (span.size + 7) // 8 if _is_bits(place) else 2 * span.size * place.registers
-        request = 5 if self._single(place, span) else 6 + data
-        return Cost(self.chars(request), 0 if self.broadcast else self.chars(5))
-
-    def _place(self, span: Span) -> Place | None:
-        place = self.dialect.places.get(span.area)
-        if place is None or span.size < 1:
-            return None
-        area = place.area
-        whole = area.first <= span.start and span.start + span.size - 1 <= area.last
-        return place if whole else None
-
-    def _most(self, place: Place, *, reading: bool) -> int:
-        limits = self.limits
-        if _is_bits(place):
-            return limits.read_bits if reading else limits.write_bits
-        return limits.read_words if reading else limits.write_words
-
-    def _single(self, place: Place, span: Span) -> bool:
-        return self.write_single and span.size == 1 and place.registers == 1
+        Settings.__post_init__(self)
+        object.__setattr__(self, "_numbers", count(1) if self.numbered else repeat(0))
+        object.__setattr__(self, "_prepared", {})
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
         request, head, length, chars, units = self._prepared.get(span) or self._prepare(span)
@@ -122,7 +74,7 @@ class Master:
         return [*first, *await self.read(talk, Span(area, start + 16, size - 16))]
 
     def _prepare(self, span: Span) -> ReadRequest:
-        place = self._place(span)
+        place = self.place_of(span)
         if place is None or self.cost(span) is None:
             raise BadValue(f"{span} cannot be read with one request")
         registers = span.size * place.registers
@@ -138,21 +90,21 @@ class Master:
 
     def _units_in(self, place: Place, span: Span) -> Callable[[bytes], Sequence[int]]:
         """Returns the decoder of a reply that holds the span and nothing else."""
-        if _is_bits(place):
+        if place.of_bits:
             return pdu.bits_in(span.size)
         if place.area.unit is Unit.DWORD:
-            return pdu.dwords_in(span.size, low_first=self.low_first)
+            return pdu.dwords_in(span.size, low_first=self.counter_word_order == "low_first")
         return pdu.words_in(span.size)
 
     def learn(self, read: Read, span: Span) -> Callable[[bytes], Sequence[int]] | None:
         """Returns the decoder of the span in the reply to a read; None if it is not all in it."""
-        place = self._place(span)
+        place = self.place_of(span)
         if place is None or self.broadcast or place.function != read.function:
             return None
         begin, size = place.at(span.start) - read.wire, span.size * place.registers
         if begin < 0 or begin + size > read.size:
             return None
-        if _is_bits(place):
+        if place.of_bits:
             of_all = pdu.bits_in(read.size)
             return lambda reply: of_all(reply)[begin : begin + size]
         units = self._units_in(place, span)
@@ -163,7 +115,7 @@ class Master:
 
     def changes_bits(self, span: Span) -> bool:
         """True for a register of a device whose manual does not say that it lacks function 22."""
-        place = self._place(span)
+        place = self.place_of(span)
         own = place is not None and place.function == 3 and place.area.writable
         return own and self.dialect.standard and not self.broadcast
 
@@ -202,17 +154,17 @@ class Master:
         return await talk.ask(frame, self.chars(length), answers)
 
     def _write_request(self, span: Span, units: Sequence[int]) -> bytes:
-        place = self._place(span)
+        place = self.place_of(span)
         if place is None or self.write_cost(span) is None or len(units) != span.size:
             raise BadValue(f"{len(units)} units for {span} cannot be written with one request")
         largest = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFF_FFFF}[place.area.unit]
         if not all(0 <= unit <= largest for unit in units):
             raise BadValue(f"units of {span.area} are 0 to {largest}")
-        wire, single = place.at(span.start), self._single(place, span)
-        if _is_bits(place):
+        wire, single = place.at(span.start), self.is_single(place, span)
+        if place.of_bits:
             return pdu.write_bits_request(wire, units, single=single)
         if place.area.unit is Unit.DWORD:
-            units = pdu.words_of(units, low_first=self.low_first)
+            units = pdu.words_of(units, low_first=self.counter_word_order == "low_first")
         return pdu.write_words_request(wire, units, single=single)
 
     async def resync(
@@ -231,30 +183,27 @@ class Master:
         Reads stay inside the `spans`. If they hold no read of another byte count, every second
         resync reads one of them, in turn, and the others read beyond the spans.
         """
-        loopback = self.diagnostics and (self.numbered or not talk.may_echo)
         pick = self._harmless_pick(outstanding, spans)
-        first, second = pick(probe_token), pick(probe_token + 1)
+        loopback = self.diagnostics and (self.numbered or not talk.may_echo)
+        if not loopback and not self.numbered:
+            return await resync_by_reads(
+                lambda span: self.read(talk, span), probe_token, outstanding, pick, self.reply_shape
+            )
         try:
             if loopback:
                 await self._loopback(talk, probe_token & 0xFFFF)
             else:
-                await self.read(talk, first)
+                await self.read(talk, pick(probe_token))
         except Refused:
-            if self.numbered:
-                return EVERY_REQUEST
-            if loopback or self._form(first) == self._form(second):
+            if not self.numbered:
                 raise
-            await self.read(talk, second)
-            first = second
-        if self.numbered or loopback:
-            return EVERY_REQUEST
-        return told_from(first, probe_token, outstanding, pick, self._form)
+        return EVERY_REQUEST
 
     def _harmless_pick(
         self, outstanding: Span | None, spans: Sequence[Span]
     ) -> Callable[[int], Span]:
         """Returns the read of each probe token."""
-        if inside := HarmlessReads(spans, None if self.numbered else outstanding, self._form):
+        if inside := HarmlessReads(spans, None if self.numbered else outstanding, self.reply_shape):
             return inside.pick
         beyond = self._harmless(outstanding)
         # The device may be silent about the outstanding address: the others are asked first.
@@ -270,22 +219,17 @@ class Master:
 
         return pick
 
-    def _form(self, span: Span) -> tuple[int, int] | None:
-        """Returns the function and the length of the reply to a read."""
-        cost, place = self.cost(span), self._place(span)
-        return None if cost is None or place is None else (place.function, cost.reply)
-
     def _harmless(self, outstanding: Span | None) -> Sequence[Span]:
         """Short reads near the `outstanding` one, of different byte counts, none equal to its."""
         places = self.dialect.places
         near = outstanding
-        if near is None or self._place(near) is None:
+        if near is None or self.place_of(near) is None:
             first = (places.get("D") or next(iter(places.values()))).area
             near = Span(first.name, first.first, 0)
         place = places[near.area]
-        area, step = place.area, 8 if _is_bits(place) else 1
+        area, step = place.area, 8 if place.of_bits else 1
         steps = (near.size + step - 1) // step
-        room = min(self._most(place, reading=True) // place.registers, area.last - area.first + 1)
+        room = min(self.most(place, reading=True) // place.registers, area.last - area.first + 1)
         # Small ones first: they lie within the outstanding read, at addresses that the device has.
         most = max(_FEWEST_SIZES, min(steps - 1, _MOST_SIZES))
         sizes = [n * step for n in range(1, most + 2) if n != steps and n * step <= room][:most]
@@ -294,11 +238,23 @@ class Master:
             return [Span(other.name, other.first, 1)]
         return [Span(area.name, min(near.start, area.last + 1 - n), n) for n in sizes]
 
-    # The shapes of replies
+    # Listening to another master, and the shapes of replies
+
+    @property
+    def framing(self) -> Hashable:
+        return self.protocol
+
+    @property
+    def unnumbered(self) -> bool:
+        return not self.numbered
+
+    def is_reply(self, frame: Frame) -> bool:
+        return isinstance(frame, Frame) and frame.station == self.station
 
     def reply_shape(self, span: Span) -> Hashable:
         """Function and length: a reply to a read names no address."""
-        return self._form(span)
+        cost, place = self.cost(span), self.place_of(span)
+        return None if cost is None or place is None else (place.function, cost.reply)
 
     def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
         """The whole reply: it repeats the address, and the value or the count."""
@@ -311,43 +267,23 @@ class Master:
         return (request[:5],)
 
     def resync_shape(
-        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span]
+        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
     ) -> Hashable:
         """None for function 08 with its token."""
         if self.diagnostics:
             return None
-        return self._form(self._harmless_pick(outstanding, spans)(probe_token))
+        return self.reply_shape(self._harmless_pick(outstanding, spans)(probe_token))
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)
-        await self.ask(talk, request, 5, lambda heard: heard == request or None)
-
-    async def ask(
-        self, talk: Talk[Frame], request: bytes, longest: int, accept: Callable[[bytes], T | None]
-    ) -> T:
-        """Sends a request. `accept` returns the contents of its reply of at most `longest` bytes,
-        or None for another frame."""
         number = next(self._numbers) & 0xFFFF
 
-        def answers(heard: Frame) -> T | None:
+        def answers(heard: Frame) -> bool | None:
             if heard.station != self.station or heard.transaction != number:
                 return None
-            if (found := accept(heard.pdu)) is not None:
-                return found
+            if heard.pdu == request:
+                return True
             pdu.raise_refusal(heard.pdu, request[0])
             return None
 
-        return await talk.ask(Frame(self.station, request, number), self.chars(longest), answers)
-
-    @property
-    def identity_names(self) -> Collection[str]:
-        return NAMES if self.dialect.standard and not self.broadcast else ()
-
-    def identify(
-        self, talk: Talk[Frame], names: Collection[str]
-    ) -> Coroutine[Any, Any, Mapping[str, Sequence[str]]]:
-        return identify(self.ask, talk, names)
-
-
-def _is_bits(place: Place) -> bool:
-    return place.function in READ_BITS
+        await talk.ask(Frame(self.station, request, number), self.chars(5), answers)

@@ -11,7 +11,7 @@ from gateway.errors import BadValue, ConfigError, Refusal, Refused
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
-from gateway.protocols.harmless import HarmlessReads, told_from
+from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.vigor.codec import (
     FORCE_OFF,
@@ -175,20 +175,9 @@ class Vigor:
         follows it.
         """
         pick = _pick(outstanding, spans)
-        first, second = pick(probe_token), pick(probe_token + 1)
-        try:
-            await self._read_cover(talk, first)
-        except Refused:
-            if _bytes(first) == _bytes(second):
-                raise
-            await self._read_cover(talk, second)
-            first = second
-        return told_from(first, probe_token, outstanding, pick, _bytes)
-
-    async def _read_cover(self, talk: Talk[Frame], span: Span) -> None:
-        covered = cover(span)
-        if covered is not None:
-            await self._read_bytes(talk, covered.address, covered.size)
+        return await resync_by_reads(
+            lambda span: self.read(talk, span), probe_token, outstanding, pick, _bytes
+        )
 
     # Listening to another master
 
