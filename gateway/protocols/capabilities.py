@@ -94,9 +94,6 @@ class NoReplyCauses(Protocol):
 class StrayFrames(Protocol):
     """A driver that can explain stray frames: frames that are no reply to any request."""
 
-    def from_this_station(self, frame: Any) -> bool:
-        """Returns True when the device itself sent the frame."""
-
     def describe_stray(self, frame: Any) -> str | None:
         """Returns a phrase for the log; None for a frame that needs no explanation."""
 

@@ -5,13 +5,22 @@ A table lists the letters of a device and their areas, which differ by number: V
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Area, Unit
 
 # Letters -> areas. Where several letters name one area, the first is the one it is spelled with.
 DeviceTable = Mapping[str, Sequence[Area]]
+
+
+def device_table(areas: Iterable[Area], **also: str) -> DeviceTable:
+    """Returns the letters of the areas: those of `M9` are M. `also`: other letters of the same."""
+    table: dict[str, list[Area]] = {}
+    for area in areas:
+        table.setdefault(area.name.rstrip("0123456789"), []).append(area)
+    return table | {letters: table[same] for letters, same in also.items()}
+
 
 # Nine digits are more than any device has, and fewer than `int` refuses.
 _DEVICE = re.compile(r"([A-Za-z]+)([0-9]{1,9})(?:\.([0-9]{1,9}))?")

@@ -20,6 +20,10 @@ class Unit(StrEnum):
     WORD = "word"  # 16 bits
     DWORD = "dword"  # 32 bits by nature: Vigor and FX counters from C200 on
 
+    @property
+    def largest(self) -> int:
+        return {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFF_FFFF}[self]
+
 
 @dataclass(frozen=True, slots=True)
 class Area:
@@ -32,6 +36,10 @@ class Area:
     octal: bool = False
     readable: bool = True
     writable: bool = True
+
+    def holds(self, span: "Span") -> bool:
+        """Returns True if the span has addresses, and all of them are of this area."""
+        return 0 < span.size <= self.last + 1 - span.start and self.first <= span.start
 
 
 class Address(NamedTuple):

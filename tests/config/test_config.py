@@ -542,7 +542,7 @@ TAGS = [
         "no such device letter",
         tags("a: {address: R100}"),
         f"8: {M}.tags.a.address: R100: there is no device R; "
-        "there are X, Y, M, S, T, C, D, TN, CN, TS, CS, TC, CC",
+        "there are X, Y, M, S, TS, CS, TC, CC, T, D, C, TN, CN",
     ),
     bad(
         "bit 16",

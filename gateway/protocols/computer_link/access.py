@@ -130,10 +130,7 @@ def words_around(profile: Profile, span: Span) -> Access | None:
 
 def _area(profile: Profile, span: Span) -> Area | None:
     area = profile.areas.get(span.area)
-    if area is None or span.size < 1:
-        return None
-    inside = area.first <= span.start and span.start + span.size <= area.last + 1
-    return area if inside else None
+    return area if area is not None and area.holds(span) else None
 
 
 def _within(profile: Profile, access: Access | None, sixteens: int) -> Access | None:

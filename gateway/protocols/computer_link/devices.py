@@ -4,10 +4,10 @@ Liyan Computer Link manual 1-5 and chapter 2; Mitsubishi's ranges and limits aft
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
-from gateway.protocols.devices import DeviceTable
+from gateway.protocols.devices import DeviceTable, device_table
 from gateway.protocols.driver import Area, Unit
 
 DEVICE = 5  # characters of a device on the wire
@@ -23,7 +23,6 @@ class Profile:
     `dwords` counters of 32 bits, read or written.
     """
 
-    table: DeviceTable
     areas: Mapping[str, Area]
     last_station: int
     read_bits: int  # BR
@@ -35,35 +34,33 @@ class Profile:
     words: int = 64  # WR, WW
     scattered_bits: int = 20  # BT
     scattered_words: int = 10  # WT
+    table: DeviceTable = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "table", device_table(self.areas.values(), TN="T", CN="C"))
 
 
-def _device_table(last_xy: int, last_m: int, last_d: int) -> dict[str, tuple[Area, ...]]:
-    timer = Area("T", Unit.WORD, 0, 255)
-    counters = Area("C", Unit.WORD, 0, 199), Area("C32", Unit.DWORD, 200, 255)
-    return {
-        "X": (Area("X", Unit.BIT, 0, last_xy, octal=True),),
-        "Y": (Area("Y", Unit.BIT, 0, last_xy, octal=True),),
-        "M": (Area("M", Unit.BIT, 0, last_m), Area("M8", Unit.BIT, 8000, 8255)),
-        "S": (Area("S", Unit.BIT, 0, 999),),
-        "TS": (Area("TS", Unit.BIT, 0, 255),),
-        "CS": (Area("CS", Unit.BIT, 0, 255),),
-        "T": (timer,),
-        "TN": (timer,),
-        "C": counters,
-        "CN": counters,
-        "D": (Area("D", Unit.WORD, 0, last_d), Area("D8", Unit.WORD, 8000, 8255)),
-    }
-
-
-def _areas(table: DeviceTable) -> dict[str, Area]:
-    return {area.name: area for areas in table.values() for area in areas}
+def _areas(last_xy: int, last_m: int, last_d: int) -> dict[str, Area]:
+    areas = (
+        Area("X", Unit.BIT, 0, last_xy, octal=True),
+        Area("Y", Unit.BIT, 0, last_xy, octal=True),
+        Area("M", Unit.BIT, 0, last_m),
+        Area("M8", Unit.BIT, 8000, 8255),
+        Area("S", Unit.BIT, 0, 999),
+        Area("TS", Unit.BIT, 0, 255),
+        Area("CS", Unit.BIT, 0, 255),
+        Area("T", Unit.WORD, 0, 255),
+        Area("C", Unit.WORD, 0, 199),
+        Area("C32", Unit.DWORD, 200, 255),
+        Area("D", Unit.WORD, 0, last_d),
+        Area("D8", Unit.WORD, 8000, 8255),
+    )
+    return {area.name: area for area in areas}
 
 
 def _liyan(last_xy: int) -> Profile:
-    table = _device_table(last_xy, last_m=1535, last_d=3999)
     return Profile(
-        table,
-        _areas(table),
+        _areas(last_xy, last_m=1535, last_d=3999),
         last_station=0x1F,
         read_bits=64,
         write_bits=64,
@@ -73,26 +70,22 @@ def _liyan(last_xy: int) -> Profile:
     )
 
 
-def _fx() -> Profile:
-    table = _device_table(0o267, last_m=3071, last_d=7999)
-    return Profile(
-        table,
-        _areas(table),
-        last_station=0x0F,
-        read_bits=256,
-        write_bits=160,
-        dwords=32,
-        loopback=254,
-        monitored=0,
-    )
-
+_FX = Profile(
+    _areas(0o267, last_m=3071, last_d=7999),
+    last_station=0x0F,
+    read_bits=256,
+    write_bits=160,
+    dwords=32,
+    loopback=254,
+    monitored=0,
+)
 
 PROFILES: Mapping[ProfileName, Profile] = {
     "liyan": _liyan(last_xy=0o177),
     "ex1s": _liyan(last_xy=0o17),
     "ex1n": _liyan(last_xy=0o177),
     "ex2n": _liyan(last_xy=0o177),
-    "fx": _fx(),
+    "fx": _FX,
 }
 
 _CODES = {"M8": "M", "D8": "D", "T": "TN", "C": "CN", "C32": "CN"}

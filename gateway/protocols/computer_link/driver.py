@@ -47,7 +47,6 @@ from gateway.protocols.listening import Ear, Learn
 LinkTalk = Talk[Frame]
 T = TypeVar("T")
 
-_TRAITS = Traits(baudrate=9600, format="7E1")
 _COUNT, _CODE = 2, 2  # characters of a count, of an error code
 _ACK = "ack"
 _WIDER = 4  # addresses around the only one, for reads of another length
@@ -82,7 +81,11 @@ class ComputerLink:
             for checked in (True, False)
         ),
     )
+    traits: ClassVar = Traits(baudrate=9600, format="7E1")
     no_reply_causes: ClassVar = NO_REPLY_CAUSES
+    unnumbered: ClassVar = True
+    controls: ClassVar = frozenset({"run", "stop", "loopback", "model", "global"})
+    broadcast_commands: ClassVar = frozenset({"global"})
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_kind", ResyncKind())
@@ -110,10 +113,6 @@ class ComputerLink:
     @property
     def areas(self) -> Mapping[str, Area]:
         return self._limits.areas
-
-    @property
-    def traits(self) -> Traits:
-        return _TRAITS
 
     @property
     def echo_conflict(self) -> tuple[str, str] | None:
@@ -213,14 +212,6 @@ class ComputerLink:
 
     # Commands (2-11 to 2-13) and resync
 
-    @property
-    def controls(self) -> frozenset[str]:
-        return frozenset({"run", "stop", "loopback", "model", "global"})
-
-    @property
-    def broadcast_commands(self) -> frozenset[str]:
-        return frozenset({"global"})
-
     async def control(self, talk: LinkTalk, command: str, argument: str) -> str:
         """Sends `run`, `stop`, `model`; `loopback` with a text; `global` with on or off.
 
@@ -307,10 +298,6 @@ class ComputerLink:
 
     # The shapes of replies
 
-    @property
-    def unnumbered(self) -> bool:
-        return True
-
     def reply_shape(self, span: Span) -> Hashable:
         """The number of characters: data names no command and no device."""
         cost = self.cost(span)
@@ -333,9 +320,6 @@ class ComputerLink:
         """False for an enquiry, and for on-demand data."""
         own = frame.station == self.station and not isinstance(frame, Enquiry)
         return own and not (isinstance(frame, Text) and frame.pc == PC_ON_DEMAND)
-
-    def from_this_station(self, frame: Frame) -> bool:
-        return frame.station == self.station
 
     def describe_stray(self, frame: Frame) -> str | None:
         """Explains on-demand data of the PLC, and the echo of a request."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from gateway.errors import ConfigError
-from gateway.protocols.devices import DeviceTable, parse_device, spell_device
+from gateway.protocols.devices import DeviceTable, device_table, parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Unit
 from gateway.protocols.modbus.frame import READ_BITS
 
@@ -192,25 +192,12 @@ _VIGOR = _by_name(
 )
 
 
-def _table(places: Mapping[str, Place], **letters: str) -> DeviceTable:
-    return {name: [places[area].area for area in areas.split()] for name, areas in letters.items()}
+def _table(places: Mapping[str, Place]) -> DeviceTable:
+    areas = (place.area for place in places.values() if not place.area.name.endswith("W"))
+    return device_table(areas, TN="T", CN="C")
 
 
-_VIGOR_DEVICES = _table(
-    _VIGOR,
-    X="X",
-    Y="Y",
-    M="M M9",
-    S="S",
-    T="T",
-    C="C C32",
-    D="D D9",
-    TN="T",
-    CN="C C32",
-    TS="TS",
-    CS="CS",
-)
-
+_VIGOR_DEVICES = _table(_VIGOR)
 VIGOR = Dialect(
     _VIGOR,
     lambda text: parse_device(text, _VIGOR_DEVICES),
@@ -247,18 +234,7 @@ _K120S = _by_name(
     Place(Area("S", Unit.WORD, 0, 99), 0x7000, 3),
     Place(Area("D", Unit.WORD, 0, 4999), 0x8000, 3),
 )
-_K120S_DEVICES = _table(
-    _K120S,
-    **{letter: letter for letter in _RELAYS},  # for its messages; read by `_k120s` itself
-    T="T",
-    C="C",
-    S="S",
-    D="D",
-    TN="T",
-    CN="C",
-    TS="TS",
-    CS="CS",
-)
+_K120S_DEVICES = _table(_K120S)  # with the relays for its messages: `_k120s` reads these
 _K120S_WIDTHS = {"T": 3, "C": 3, "TS": 3, "CS": 3, "S": 2, "D": 4}
 _K120S_RELAY = re.compile(r"([PMLKF])([0-9]{3})(?:([0-9A-F])|\.([0-9]{1,2}))?")
 

@@ -157,7 +157,7 @@ class Master(Settings):
         place = self.place_of(span)
         if place is None or self.write_cost(span) is None or len(units) != span.size:
             raise BadValue(f"{len(units)} units for {span} cannot be written with one request")
-        largest = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFF_FFFF}[place.area.unit]
+        largest = place.area.unit.largest
         if not all(0 <= unit <= largest for unit in units):
             raise BadValue(f"units of {span.area} are 0 to {largest}")
         wire, single = place.at(span.start), self.is_single(place, span)

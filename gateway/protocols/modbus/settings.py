@@ -121,11 +121,7 @@ class Settings:
 
     def place_of(self, span: Span) -> Place | None:
         place = self.dialect.places.get(span.area)
-        if place is None or span.size < 1:
-            return None
-        area = place.area
-        whole = area.first <= span.start and span.start + span.size - 1 <= area.last
-        return place if whole else None
+        return place if place is not None and place.area.holds(span) else None
 
     def most(self, place: Place, *, reading: bool) -> int:
         limits = self.limits

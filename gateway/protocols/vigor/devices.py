@@ -5,7 +5,7 @@ from functools import lru_cache
 from itertools import chain
 from typing import NamedTuple
 
-from gateway.protocols.devices import DeviceTable
+from gateway.protocols.devices import device_table
 from gateway.protocols.driver import Area, Span, Unit
 from gateway.protocols.vigor.codec import MOST_BYTES
 
@@ -32,25 +32,8 @@ _BASES = {area.name: base for area, base in _PLACES}
 # The areas for 70 and 71 in the manual; bits of T and C can only be written as whole bytes.
 FORCIBLE = frozenset({"X", "Y", "M", "S", "M9"})
 
-# The letters of the devices. M and D continue at 9000, after a gap.
-DEVICES: DeviceTable = {
-    letters: tuple(AREAS[name] for name in names)
-    for letters, names in {
-        "X": ("X",),
-        "Y": ("Y",),
-        "M": ("M", "M9"),
-        "S": ("S",),
-        "T": ("T",),
-        "C": ("C", "C32"),
-        "D": ("D", "D9"),
-        "TN": ("T",),
-        "CN": ("C", "C32"),
-        "TS": ("TS",),
-        "CS": ("CS",),
-        "TC": ("TC",),
-        "CC": ("CC",),
-    }.items()
-}
+# M and D continue at 9000, after a gap.
+DEVICES = device_table(AREAS.values(), TN="T", CN="C")
 
 
 class Cover(NamedTuple):
@@ -66,9 +49,7 @@ class Cover(NamedTuple):
 def cover(span: Span) -> Cover | None:
     """Returns the bytes that hold `span`; None for too many, or a span outside its area."""
     area = AREAS.get(span.area)
-    if area is None or span.size < 1 or span.start < area.first:
-        return None
-    if span.start + span.size - 1 > area.last:
+    if area is None or not area.holds(span):
         return None
     offset, base = span.start - area.first, _BASES[area.name]
     match area.unit:

@@ -2,7 +2,7 @@
 
 import re
 import struct
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import ClassVar, Literal
@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
+from gateway.protocols.driver import Address, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.vigor.codec import (
@@ -39,7 +39,6 @@ from gateway.protocols.vigor.ear import vigor_ear
 
 # Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
 _BLOCK_REQUEST, _FORCE_REQUEST = 14, 12
-_LARGEST = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFFFFFF}
 _NO_COMMAND = "12"
 _REFUSALS = {
     "10": (Refusal.DAMAGED, "ASCII conversion error, our request did not arrive whole"),
@@ -50,7 +49,6 @@ _REFUSALS = {
 }
 _TRAITS = Traits(baudrate=19200, format="7E1", one_format=True)
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
-_TIMING = Timing(reply_timeout=0.5, turnaround=0.005, silence=0.005, retries=2, learn_silence=True)
 _PROBE_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: no read of words has these
 
 
@@ -66,7 +64,10 @@ class Vigor:
     format: str = _TRAITS.format
 
     codec: ClassVar = VigorCodec
+    areas: ClassVar = AREAS
+    timing: ClassVar = Timing(silence=0.005, learn_silence=True)
     scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1"), stations=range(32))
+    unnumbered: ClassVar = True
 
     def __post_init__(self) -> None:
         if not 0 <= self.station <= 255:
@@ -79,17 +80,9 @@ class Vigor:
         return (b"\x06%02X%s00" % (self.station, READ.encode()),)
 
     @property
-    def areas(self) -> Mapping[str, Area]:
-        return AREAS
-
-    @property
     def traits(self) -> Traits:
         usual = self.format == _TRAITS.format
         return _TRAITS if usual else replace(_TRAITS, format=self.format)
-
-    @property
-    def timing(self) -> Timing:
-        return _TIMING
 
     def address(self, text: str) -> Address:
         """Parses `X17` and `Y20` (octal), `M12`, `S5`, `D100`, `D7.3`, `M9003`, `D9001`; timers
@@ -139,8 +132,8 @@ class Vigor:
         if covered is None or len(units) != span.size:
             raise BadValue(f"{len(units)} values for {span.size} of {span.area} from {span.start}")
         unit = AREAS[span.area].unit
-        if not all(0 <= value <= _LARGEST[unit] for value in units):
-            raise BadValue(f"a {unit} holds 0..{_LARGEST[unit]}")
+        if not all(0 <= value <= unit.largest for value in units):
+            raise BadValue(f"a {unit} holds 0..{unit.largest}")
         if _forced(span):
             command = FORCE_ON if units[0] else FORCE_OFF
             body = b"%04X" % bit_address(span.area, span.start)
@@ -198,10 +191,6 @@ class Vigor:
         return None if end > count else lambda data: _units(data[begin:end], span, covered)
 
     # The shapes of replies
-
-    @property
-    def unnumbered(self) -> bool:
-        return True
 
     def reply_shape(self, span: Span) -> Hashable:
         """The number of bytes: a reply names station and command, but no address."""
