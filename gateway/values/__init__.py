@@ -61,23 +61,7 @@ class Byte(StrEnum):
     HIGH = "high"
 
 
-_WORDS = {
-    Kind.BOOL: 1,
-    Kind.INT8: 1,
-    Kind.UINT8: 1,
-    Kind.INT16: 1,
-    Kind.UINT16: 1,
-    Kind.BCD16: 1,
-    Kind.INT32: 2,
-    Kind.UINT32: 2,
-    Kind.FLOAT32: 2,
-    Kind.BCD32: 2,
-    Kind.INT64: 4,
-    Kind.UINT64: 4,
-    Kind.FLOAT64: 4,
-    Kind.TELEPHONE: 6,
-}
-_STRUCT = {
+STRUCT: dict[str, str] = {  # by kind
     Kind.INT8: ">b",
     Kind.UINT8: ">B",
     Kind.INT16: ">h",
@@ -88,6 +72,9 @@ _STRUCT = {
     Kind.UINT64: ">Q",
     Kind.FLOAT32: ">f",
     Kind.FLOAT64: ">d",
+}
+_WORDS: dict[str, int] = {Kind.BOOL: 1, Kind.BCD16: 1, Kind.BCD32: 2, Kind.TELEPHONE: 6} | {
+    kind: (struct.calcsize(form) + 1) // 2 for kind, form in STRUCT.items()
 }
 _FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
 _BCD = (Kind.BCD16, Kind.BCD32)
@@ -212,7 +199,7 @@ def from_words(layout: Layout) -> FromWords:
         return lambda words: _from_bcd(_ordered(words, layout))
     if kind is Kind.TELEPHONE:
         return telephone_number
-    unpack = struct.Struct(_STRUCT[kind]).unpack
+    unpack = struct.Struct(STRUCT[kind]).unpack
     if kind is Kind.FLOAT32:
         return lambda words: shortest(unpack(_octets(_ordered(words, layout)))[0])
     if kind is Kind.FLOAT64:
@@ -253,7 +240,7 @@ def to_words(layout: Layout) -> ToWords:
         return lambda value: _ordered(_to_bcd(whole(value), digits), layout)
     if kind is Kind.TELEPHONE:
         return telephone_words
-    pack = struct.Struct(_STRUCT[kind]).pack
+    pack = struct.Struct(STRUCT[kind]).pack
     convert: Callable[[Scalar], int | float] = real if kind in _FLOATS else whole
 
     def encode(value: Scalar) -> list[int]:
@@ -269,7 +256,7 @@ def to_words(layout: Layout) -> ToWords:
 
 def _byte(value: int, kind: Kind) -> int:
     try:
-        (byte,) = struct.pack(_STRUCT[kind], value)
+        (byte,) = struct.pack(STRUCT[kind], value)
     except struct.error:
         raise BadValue(f"{value} does not fit {kind.value} ({_bounds(kind)})") from None
     return int(byte)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
-from gateway.values import LONGEST_STRING, Kind, ValueType
+from gateway.values import LONGEST_STRING, STRUCT, Kind, ValueType
 from gateway.values.numerals import Scalar, real, shortest, whole
 
 FieldType = Literal[
@@ -29,18 +29,6 @@ FieldType = Literal[
     "decimal",
 ]
 
-_STRUCT = {
-    "uint8": ">B",
-    "int8": ">b",
-    "uint16": ">H",
-    "int16": ">h",
-    "uint32": ">I",
-    "int32": ">i",
-    "uint64": ">Q",
-    "int64": ">q",
-    "float32": ">f",
-    "float64": ">d",
-}
 _BCD = {"bcd8": 1, "bcd16": 2, "bcd32": 4}
 _FLOATS = ("float32", "float64")
 _WIDER = {
@@ -159,12 +147,12 @@ class Field:
 
     @property
     def _octets(self) -> int:
-        return _BCD.get(self.type) or struct.calcsize(_STRUCT[self.type])
+        return _BCD.get(self.type) or struct.calcsize(STRUCT[self.type])
 
     @property
     def size(self) -> int | None:
         """Its characters in the frame; None where the number varies."""
-        if self.type in _BCD or self.type in _STRUCT:
+        if self.type in _BCD or self.type in STRUCT:
             return self._octets * (2 if self.hex else 1)
         return None
 
@@ -228,7 +216,7 @@ class Field:
             if not ordered.hex().isdecimal():
                 raise _garbled("a BCD digit above 9", raw)
             return int(ordered.hex())
-        number: int | float | None = struct.unpack(_STRUCT[self.type], ordered)[0]
+        number: int | float | None = struct.unpack(STRUCT[self.type], ordered)[0]
         if self.type == "float32" and number is not None:
             number = shortest(number)
         if number is None or not math.isfinite(number):
@@ -273,7 +261,7 @@ class Field:
             if self.type in _BCD:
                 raw = bytes.fromhex(f"{value:0{2 * self._octets}d}") if value >= 0 else b""
             else:
-                raw = struct.pack(_STRUCT[self.type], value)
+                raw = struct.pack(STRUCT[self.type], value)
         except (struct.error, OverflowError, ValueError):
             raw = b""
         if len(raw) != self._octets:

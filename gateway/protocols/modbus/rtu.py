@@ -35,6 +35,11 @@ def chars(pdu_length: int) -> int:
     return pdu_length + _WRAPPING
 
 
+def encode(frame: Frame) -> bytes:
+    body = bytes((frame.station,)) + frame.pdu
+    return body + crc16(body)
+
+
 class RtuCodec:
     """Bytes <-> frames on the side of the master.
 
@@ -51,8 +56,7 @@ class RtuCodec:
         self._damage: Garbled | None = None
 
     def encode(self, frame: Frame) -> bytes:
-        body = bytes((frame.station,)) + frame.pdu
-        self._sent = body + crc16(body)
+        self._sent = encode(frame)
         self._size = chars(answer_length(frame.pdu))
         return self._sent
 
@@ -146,9 +150,7 @@ class RtuSlaveCodec:
         self._heard = bytearray()
         self._addressed = (0, station)
 
-    def encode(self, frame: Frame) -> bytes:
-        body = bytes((frame.station,)) + frame.pdu
-        return body + crc16(body)
+    encode = staticmethod(encode)
 
     def feed(self, data: bytes) -> list[Frame]:
         self._heard += data

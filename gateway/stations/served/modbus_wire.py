@@ -10,6 +10,7 @@ from gateway.protocols.modbus.frame import (
     WRITE_MANY,
     WRITE_SINGLE,
 )
+from gateway.protocols.modbus.rtu import encode as rtu_encode
 from gateway.stations.modbus.answers import ModbusData
 from gateway.stations.served.answering import (
     NOISE,
@@ -187,10 +188,7 @@ class RtuReader:
         self._anew = 0
         self._lost, self._skipped = False, 0
 
-    @staticmethod
-    def encode(frame: Frame) -> bytes:
-        body = bytes((frame.station,)) + frame.pdu
-        return body + crc16(body)
+    encode = staticmethod(rtu_encode)
 
     def _take(self) -> Frame | None:
         """Returns the frame at the beginning; None while it is incomplete, or where none begins."""
