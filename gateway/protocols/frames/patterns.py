@@ -8,9 +8,9 @@ a comma) counts once, one whose end is open (`.*` before a digit) as often as it
 
 import re
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 from gateway.errors import ConfigError
 
@@ -40,7 +40,7 @@ def pattern(text: str) -> re.Pattern[bytes]:
 def check_pattern(text: str, longest: int) -> None:
     """Raises `ConfigError` for a pattern that is wrong, or slow on a frame of `longest` bytes."""
     pattern(text)
-    steps = _ways(_Parser(text, longest).whole(), frozenset(), longest) * longest
+    steps = _Parser(text, longest).choice().ways(frozenset()) * longest
     if steps > _MOST_STEPS:
         raise ConfigError(
             f"{text!r} could keep the gateway busy: give its repeats bounds ({{1,8}} for +), "
@@ -51,116 +51,74 @@ def check_pattern(text: str, longest: int) -> None:
 @lru_cache(maxsize=1024)
 def longest_match(text: str, longest: int) -> int:
     """The most bytes that a frame of at most `longest` has if it matches."""
-    return min(longest, _width(_Parser(text, longest).whole()))
+    return min(longest, _Parser(text, longest).choice().width)
 
 
-@dataclass(frozen=True, slots=True)
-class _Atom:
+Octets = frozenset[int]
+
+
+class _Node(NamedTuple):
+    """A part of a pattern."""
+
+    first: Octets  # the bytes it can begin with
+    empty: bool  # it can match an empty text
+    width: int  # the most bytes it can match
+    ways: Callable[[Octets], int]  # to match a stretch of bytes, with one of these behind it
+
+    def before(self, follow: Octets) -> Octets:
+        """Returns the bytes that the part can begin with, with one of `follow` behind it."""
+        return self.first | follow if self.empty else self.first
+
+
+def _atom(octets: Octets) -> _Node:
     """One byte out of a set; of an empty set: a place, not a byte (`^`, `$`)."""
-
-    octets: frozenset[int]
-
-
-@dataclass(frozen=True, slots=True)
-class _Sequence:
-    parts: tuple["_Node", ...]
+    return _Node(octets, not octets, 1 if octets else 0, lambda follow: 1)
 
 
-@dataclass(frozen=True, slots=True)
-class _Choice:
-    branches: tuple["_Node", ...]
+def _sequence(parts: Sequence[_Node]) -> _Node:
+    first: Octets = frozenset()
+    for part in reversed(parts):
+        first = part.before(first)
+
+    def ways(follow: Octets) -> int:
+        total = 1
+        for part in reversed(parts):
+            total = _capped(total * part.ways(follow))
+            follow = part.before(follow)
+        return total
+
+    return _Node(first, all(part.empty for part in parts), sum(part.width for part in parts), ways)
 
 
-@dataclass(frozen=True, slots=True)
-class _Repeat:
-    part: "_Node"
-    least: int
-    most: int
+def _choice(branches: Sequence[_Node]) -> _Node:
+    def ways(follow: Octets) -> int:
+        each = [branch.ways(follow) for branch in branches]
+        return max(each) if _told_apart(branches, follow) else _capped(sum(each))
+
+    first = frozenset[int]().union(*(branch.first for branch in branches))
+    empty, width = any(one.empty for one in branches), max(one.width for one in branches)
+    return _Node(first, empty, width, ways)
 
 
-_Node = _Atom | _Sequence | _Choice | _Repeat
+def _repeat(part: _Node, least: int, most: int) -> _Node:
+    def ways(follow: Octets) -> int:
+        inner = part.ways(follow | part.first if most > 1 else follow)
+        total = 1
+        for _ in range(most if inner > 1 else 0):
+            total = _capped(total * inner)
+        open_end = bool(part.first & follow) or part.empty
+        return _capped(total * (most - least + 1)) if open_end else total
+
+    return _Node(part.first, least == 0 or part.empty, most * part.width, ways)
 
 
-def _first(node: _Node) -> frozenset[int]:
-    """The bytes it can begin with."""
-    match node:
-        case _Atom(octets):
-            return octets
-        case _Sequence(parts):
-            found: frozenset[int] = frozenset()
-            for part in parts:
-                found |= _first(part)
-                if not _empty(part):
-                    break
-            return found
-        case _Choice(branches):
-            return frozenset().union(*map(_first, branches))
-        case _Repeat(part):
-            return _first(part)
-
-
-def _empty(node: _Node) -> bool:
-    """True when it can match an empty text."""
-    match node:
-        case _Atom(octets):
-            return not octets
-        case _Sequence(parts):
-            return all(map(_empty, parts))
-        case _Choice(branches):
-            return any(map(_empty, branches))
-        case _Repeat(part, least):
-            return least == 0 or _empty(part)
-
-
-def _width(node: _Node) -> int:
-    """The most bytes it can match."""
-    match node:
-        case _Atom(octets):
-            return 1 if octets else 0
-        case _Sequence(parts):
-            return sum(map(_width, parts))
-        case _Choice(branches):
-            return max(map(_width, branches), default=0)
-        case _Repeat(part, _, most):
-            return most * _width(part)
-
-
-def _ways(node: _Node, follow: frozenset[int], longest: int) -> int:
-    """The most ways to match a stretch of bytes, where a byte of `follow` comes behind it."""
-    match node:
-        case _Atom():
-            return 1
-        case _Sequence(parts):
-            total = 1
-            for part in reversed(parts):
-                total = _capped(total * _ways(part, follow, longest))
-                follow = _first(part) | follow if _empty(part) else _first(part)
-            return total
-        case _Choice(branches):
-            each = [_ways(branch, follow, longest) for branch in branches]
-            return max(each) if _told_apart(branches, follow) else _capped(sum(each))
-        case _Repeat():
-            return _repeat_ways(node, follow, longest)
-
-
-def _repeat_ways(node: _Repeat, follow: frozenset[int], longest: int) -> int:
-    again = _first(node.part)
-    inner = _ways(node.part, follow | again if node.most > 1 else follow, longest)
-    total = 1
-    for _ in range(node.most if inner > 1 else 0):
-        total = _capped(total * inner)
-    open_end = bool(again & follow) or _empty(node.part)
-    return _capped(total * (node.most - node.least + 1)) if open_end else total
-
-
-def _told_apart(branches: tuple[_Node, ...], follow: frozenset[int]) -> bool:
-    seen: frozenset[int] = frozenset()
+def _told_apart(branches: Sequence[_Node], follow: Octets) -> bool:
+    seen: Octets = frozenset()
     for branch in branches:
-        first = _first(branch) | follow if _empty(branch) else _first(branch)
-        if seen & first:
+        if seen & branch.before(follow):
             return False
-        seen |= first
-    return sum(map(_empty, branches)) <= 1
+        seen |= branch.before(follow)
+    return sum(branch.empty for branch in branches) <= 1
 
 
 def _capped(ways: int) -> int:
@@ -175,15 +133,12 @@ class _Parser:
         self._longest = longest
         self._at = 0
 
-    def whole(self) -> _Node:
-        return self._choice()
-
-    def _choice(self) -> _Node:
-        branches = [_Sequence(tuple(self._items()))]
+    def choice(self) -> _Node:
+        branches = [_sequence(list(self._items()))]
         while self._text.startswith("|", self._at):
             self._at += 1
-            branches.append(_Sequence(tuple(self._items())))
-        return _Choice(tuple(branches)) if len(branches) > 1 else branches[0]
+            branches.append(_sequence(list(self._items())))
+        return _choice(branches) if len(branches) > 1 else branches[0]
 
     def _items(self) -> Iterator[_Node]:
         while self._at < len(self._text) and self._text[self._at] not in "|)":
@@ -197,7 +152,7 @@ class _Parser:
                 f"{self._text!r}: of groups there are (...), (?:...) and (?P<name>...) only"
             )
         self._at = opening.end()
-        node = self._choice()
+        node = self.choice()
         self._at += 1
         return node
 
@@ -214,7 +169,7 @@ class _Parser:
             end = found.end()
         atom = self._text[self._at : end]
         self._at = end
-        return _Atom(_set_of(atom))
+        return _atom(_set_of(atom))
 
     def _repeated(self, node: _Node) -> _Node:
         match = _REPEAT.match(self._text, self._at)
@@ -223,7 +178,7 @@ class _Parser:
         self._at = match.end()
         least, most = _bounds(match)
         most = self._longest if most is None else min(most, self._longest)
-        return _Repeat(node, min(least, most), most)
+        return _repeat(node, min(least, most), most)
 
 
 def _bounds(match: re.Match[str]) -> tuple[int, int | None]:
@@ -236,7 +191,7 @@ def _bounds(match: re.Match[str]) -> tuple[int, int | None]:
 
 
 @lru_cache(maxsize=512)
-def _set_of(atom: str) -> frozenset[int]:
+def _set_of(atom: str) -> Octets:
     try:
         rule = re.compile(atom.encode("latin-1"), re.DOTALL)
     except re.error:
