@@ -82,15 +82,6 @@ class Windowed(Protocol):
 
 
 @runtime_checkable
-class NoReplyCauses(Protocol):
-    """A driver with causes why its device may not reply at all."""
-
-    @property
-    def no_reply_causes(self) -> str:
-        """The causes, in a sentence or two for people."""
-
-
-@runtime_checkable
 class StrayFrames(Protocol):
     """A driver that can explain stray frames: frames that are no reply to any request."""
 
@@ -164,15 +155,6 @@ class EchoConflict(Protocol):
     @property
     def echo_conflict(self) -> tuple[str, str] | None:
         """The setting and the reason; None where the settings of this device work."""
-
-
-@runtime_checkable
-class Dissected(Protocol):
-    """A driver whose frames Wireshark knows."""
-
-    @property
-    def dissector(self) -> str:
-        """The name of the dissector in Wireshark."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -96,6 +96,8 @@ class Traits:
     word_type: Kind = Kind.INT16  # default type of a word
     string_order: Order = Order.LOW_FIRST  # default byte order of a text
     numbered: bool = True  # devices have station numbers
+    dissector: str = ""  # the name of the protocol in Wireshark
+    no_reply_causes: str = ""  # why a device may not reply at all, in a sentence or two for people
 
     @property
     def over_network(self) -> bool:

@@ -13,7 +13,6 @@ from typing import Self
 from gateway import files
 from gateway.config import LineConfig
 from gateway.errors import GatewayError
-from gateway.protocols.capabilities import Dissected
 from gateway.protocols.listening import Asked, Ear, Listenable
 
 _RAW_IP, _UPPER_PDU = 101, 252  # link types
@@ -35,7 +34,7 @@ class Capture:
 
     def __init__(self, path: Path, line: LineConfig) -> None:
         drivers = [device.driver for device in line.devices]
-        named = [one.dissector for one in drivers if isinstance(one, Dissected)]
+        named = [one.traits.dissector for one in drivers if one.traits.dissector]
         self._dissector = (named[0] if named else "data").encode()
         self._is_tcp = any(one.traits.over_network for one in drivers)
         self._sent = {_MASTER: 1, _STATION: 1}  # the sequence numbers of TCP

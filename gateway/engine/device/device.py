@@ -17,7 +17,7 @@ from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
-from gateway.protocols.capabilities import Monitor, NoReplyCauses, Windowed
+from gateway.protocols.capabilities import Monitor, Windowed
 from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
 from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
 from gateway.tags import Tag
@@ -150,8 +150,7 @@ class Device:
         heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
         if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
             return SWAPPED
-        causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
-        return diagnosis(trouble, causes)
+        return diagnosis(trouble, driver.traits.no_reply_causes)
 
     def takes_one_at_a_time(self, only: bool) -> None:
         """Notes if the device loses requests that are sent together."""

@@ -81,8 +81,7 @@ class ComputerLink:
             for checked in (True, False)
         ),
     )
-    traits: ClassVar = Traits(baudrate=9600, format="7E1")
-    no_reply_causes: ClassVar = NO_REPLY_CAUSES
+    traits: ClassVar = Traits(baudrate=9600, format="7E1", no_reply_causes=NO_REPLY_CAUSES)
     unnumbered: ClassVar = True
     controls: ClassVar = frozenset({"run", "stop", "loopback", "model", "global"})
     broadcast_commands: ClassVar = frozenset({"global"})

@@ -32,8 +32,9 @@ class ModbusRtu(Master):
 
     codec: ClassVar = rtu.RtuCodec
     scan_hints: ClassVar = ScanHints(formats=("8N1", "8E1", "8O1", "8N2"))
-    dissector: ClassVar = "mbrtu"
-    _traits: ClassVar = Traits(baudrate=9600, format="8E1", binary=True, word_type=Kind.UINT16)
+    _traits: ClassVar = Traits(
+        baudrate=9600, format="8E1", binary=True, word_type=Kind.UINT16, dissector="mbrtu"
+    )
 
     @property
     def timing(self) -> Timing:
@@ -86,10 +87,9 @@ class ModbusTcp(Master):
 
     codec: ClassVar = mbap.MbapCodec
     scan_hints: ClassVar = ScanHints(formats=())
-    dissector: ClassVar = "mbtcp"
     timing: ClassVar = Timing(turnaround=0.001, silence=0.0)
     numbered: ClassVar = True
-    _traits: ClassVar = Traits(baudrate=None, word_type=Kind.UINT16)
+    _traits: ClassVar = Traits(baudrate=None, word_type=Kind.UINT16, dissector="mbtcp")
 
     def _allowed(self, dialect: Dialect) -> tuple[range, Limits]:
         if not 1 <= self.window <= 16:
