@@ -76,7 +76,7 @@ class Listener:
         accepted = _Accepted(self._name, connect(), self._ports)
         try:
             configure(connection)
-            await loop.connect_accepted_socket(lambda: accepted.stream, connection)
+            await loop.connect_accepted_socket(lambda: accepted, connection)
         except OSError as error:  # the master is gone already
             log.debug("connection lost", port=self._name, why=str(error))
             self._ports.discard(accepted)
@@ -92,30 +92,25 @@ class Listener:
         self._ports.clear()
 
 
-class _Accepted:
+class _Accepted(StreamPort):
     """One connection; the port of its receiver. It is in the list until it is closed or lost."""
 
     def __init__(self, name: str, receiver: Connected, ports: "set[_Accepted]") -> None:
-        self.stream = StreamPort(name, self)
-        self._receiver = receiver
+        super().__init__(name, receiver)
         self._ports = ports
         self.opened_at = self.heard_at = asyncio.get_running_loop().time()
         ports.add(self)
-        self.stream.ready()
+        self.ready()
         receiver.opened(self)
-
-    def write(self, data: bytes) -> None:
-        """Raises `LineDown`."""
-        self.stream.write(data)
 
     async def close(self) -> None:
         self._ports.discard(self)
-        await self.stream.close()
+        await super().close()
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         self.heard_at = asyncio.get_running_loop().time()
-        self._receiver.received(data)
+        super().data_received(data)
 
-    def lost(self, error: Exception) -> None:
+    def connection_lost(self, exc: Exception | None) -> None:
         self._ports.discard(self)
-        self._receiver.lost(error)
+        super().connection_lost(exc)

@@ -9,8 +9,7 @@ _IAC = b"\xff"
 _SE, _SB, _WILL, _WONT, _DO, _DONT = 240, 250, 251, 252, 253, 254
 
 BINARY, SUPPRESS_GO_AHEAD, COM_PORT = 0, 3, 44  # the options to agree on; all others are declined
-_WANTED_OF_US = frozenset({BINARY, SUPPRESS_GO_AHEAD, COM_PORT})
-_WANTED_OF_THEM = _WANTED_OF_US
+_WANTED = frozenset({BINARY, SUPPRESS_GO_AHEAD, COM_PORT})  # on either side
 
 _LONGEST_SUBNEGOTIATION = 256  # bytes; a longer one is dropped, or it would swallow all data
 _SERVER = 100  # the server's reply to request n has the number n + 100
@@ -100,9 +99,9 @@ class Telnet:
 
     def start(self) -> bytes:
         """Returns the offers and requests for the options."""
-        self._ours = dict.fromkeys(sorted(_WANTED_OF_US), Consent.ASKED)
+        self._ours = dict.fromkeys(sorted(_WANTED), Consent.ASKED)
         # The client offers COM-PORT-OPTION (RFC 2217, section 2).
-        self._theirs = dict.fromkeys(sorted(_WANTED_OF_THEM - {COM_PORT}), Consent.ASKED)
+        self._theirs = dict.fromkeys(sorted(_WANTED - {COM_PORT}), Consent.ASKED)
         offers = [bytes((IAC, _WILL, option)) for option in self._ours]
         return b"".join(offers + [bytes((IAC, _DO, option)) for option in self._theirs])
 
@@ -203,11 +202,9 @@ class Telnet:
         """
         ours = verb in (_DO, _DONT)
         yes = verb in (_DO, _WILL)
-        agreements, wanted = (
-            (self._ours, _WANTED_OF_US) if ours else (self._theirs, _WANTED_OF_THEM)
-        )
+        agreements = self._ours if ours else self._theirs
         before = agreements.get(option, Consent.NO)
-        if yes and option not in wanted:
+        if yes and option not in _WANTED:
             yield Send(bytes((IAC, _WONT if ours else _DONT, option)))
             return
         if before is Consent.YES if yes else before in (Consent.NO, Consent.DECLINED):
