@@ -31,15 +31,13 @@ def register(driver: type[AnyDriver], settings: type[Any] | None = None) -> None
     that class.
     """
     build: Callable[..., AnyDriver] = driver
-    added = Protocol(driver, _itself) if settings is None else Protocol(settings, build)
+    added = (
+        Protocol(driver, lambda itself: itself) if settings is None else Protocol(settings, build)
+    )
     name = str({field.name: field.default for field in fields(added.settings)}["protocol"])
     if name in _PROTOCOLS:
         raise ValueError(f"there is a protocol {name} already")
     _PROTOCOLS[name] = added
-
-
-def _itself(driver: AnyDriver) -> AnyDriver:
-    return driver
 
 
 def unregister(name: str) -> None:

@@ -5,6 +5,7 @@ import os
 import tty
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -14,6 +15,7 @@ from gateway.stations.station import Station
 from gateway.transport.os_errors import line_down
 
 _MOST_READ = 4096  # bytes
+MakeBus = Callable[[Callable[[bytes], None]], HalfDuplex]  # of the function that takes the replies
 
 
 class Served(Protocol):
@@ -43,7 +45,8 @@ async def serve_on_pty(
         master, slave = os.openpty()
     except OSError as error:
         raise line_down("pseudo terminal", error) from error
-    served = _Pty(master, slave, stations, wire, turnaround, paced=paced)
+    bus = partial(HalfDuplex, stations, wire, turnaround=turnaround, paced=paced)
+    served = _Pty(master, slave, bus)
     if link is not None:
         try:
             served.link(Path(link))
@@ -54,23 +57,14 @@ async def serve_on_pty(
 
 
 class _Pty:
-    def __init__(
-        self,
-        master: int,
-        slave: int,
-        stations: Sequence[Station],
-        wire: WireTiming,
-        turnaround: float,
-        *,
-        paced: bool,
-    ) -> None:
+    def __init__(self, master: int, slave: int, bus: MakeBus) -> None:
         self._loop = asyncio.get_running_loop()
         self._master = master
         self._slave = slave  # kept open, or the master would end when its first user leaves
         self._name = os.ttyname(slave)
         self.address = self._name
         self._link: Path | None = None
-        self._bus = HalfDuplex(stations, wire, self._deliver, turnaround, paced=paced)
+        self._bus = bus(self._deliver)
         tty.setraw(slave)
         os.set_blocking(master, False)
         self._loop.add_reader(master, self._readable)
@@ -119,7 +113,8 @@ async def serve_on_tcp(
     Paced, one line is behind the port as behind a device server: replies go to every connection.
     Not paced (a network protocol), every connection has its own line.
     """
-    served = _Tcp(stations, wire, turnaround, paced=paced)
+    bus = partial(HalfDuplex, stations, wire, turnaround=turnaround, paced=paced)
+    served = _Tcp(bus, shared=paced)
     try:
         await served.listen(host, port)
     except (OSError, OverflowError) as error:  # OverflowError: a port number above 65535
@@ -128,18 +123,12 @@ async def serve_on_tcp(
 
 
 class _Tcp:
-    def __init__(
-        self, stations: Sequence[Station], wire: WireTiming, turnaround: float, *, paced: bool
-    ) -> None:
+    def __init__(self, bus: MakeBus, *, shared: bool) -> None:
         self.address = ""
         self._connections: set[_Connection] = set()
         self._server: asyncio.Server | None = None
-
-        def bus(deliver: Callable[[bytes], None]) -> HalfDuplex:
-            return HalfDuplex(stations, wire, deliver, turnaround, paced=paced)
-
         self._bus = bus
-        self._shared = bus(self._to_all) if paced else None
+        self._shared = bus(self._to_all) if shared else None
 
     async def listen(self, host: str, port: int) -> None:
         """Raises `OSError`."""
@@ -168,12 +157,7 @@ class _Tcp:
 
 
 class _Connection(asyncio.Protocol):
-    def __init__(
-        self,
-        others: "set[_Connection]",
-        shared: HalfDuplex | None,
-        own: Callable[[Callable[[bytes], None]], HalfDuplex],
-    ) -> None:
+    def __init__(self, others: "set[_Connection]", shared: HalfDuplex | None, own: MakeBus) -> None:
         self._others = others
         self._shared = shared
         self._bus = shared or own(self.send)

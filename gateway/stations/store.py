@@ -29,6 +29,14 @@ class Denied(Exception):
         self.why = why
 
 
+class Rejected(Exception):
+    """A request with a mistake, and the code that the protocol has for it."""
+
+    def __init__(self, code: str) -> None:
+        super().__init__(code)
+        self.code = code
+
+
 class Store(Protocol):
     """The data of one station, by area and number. Every method raises `Denied`."""
 

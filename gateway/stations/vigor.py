@@ -23,7 +23,7 @@ from gateway.protocols.vigor.codec import (
     encode,
 )
 from gateway.stations.station import Memory, MemoryStore
-from gateway.stations.store import Cell, Denied, Store, Written
+from gateway.stations.store import Cell, Denied, Rejected, Store, Written
 
 
 class Stretch(NamedTuple):
@@ -72,12 +72,6 @@ _SHORTEST = 8  # characters of a request: station and command between STX and ET
 _ASCII_ERROR, _BAD_SUM, _NO_COMMAND, _OUT_OF_RANGE = "10", "11", "12", "28"
 
 
-class _Refusal(Exception):
-    def __init__(self, status: str) -> None:
-        super().__init__(status)
-        self.status = status
-
-
 def addressed(request: bytes) -> int | None:
     """Returns the station of a request; None where the number, or all of it, is damaged."""
     number = request[1:3]
@@ -97,48 +91,48 @@ def answer(station: int, store: Store, request: bytes) -> tuple[Reply, Written]:
         return Reply(station, command, _BAD_SUM), ()
     try:
         data, written = _carry_out(store, command, content[4:])
-    except _Refusal as refusal:
-        status = refusal.status
+    except Rejected as rejected:
+        status = rejected.code
     except Denied:
         status = _OUT_OF_RANGE
     return Reply(station, command, status, data), written
 
 
 def _carry_out(store: Store, command: str, body: bytes) -> tuple[bytes, Written]:
-    """Raises `_Refusal`, `Denied`."""
+    """Raises `Rejected`, `Denied`."""
     if command == READ:
         places = _places(body)
         if len(body) != 6:
-            raise _Refusal(_ASCII_ERROR)
+            raise Rejected(_ASCII_ERROR)
         return _read(store, places), ()
     if command == WRITE:
         places = _places(body)
         if len(body) != 6 + 2 * len(places):
-            raise _Refusal(_ASCII_ERROR)
+            raise Rejected(_ASCII_ERROR)
         return b"", _write(store, places, bytes.fromhex(body[6:].decode()))
     if command not in (FORCE_ON, FORCE_OFF):
-        raise _Refusal(_NO_COMMAND)
+        raise Rejected(_NO_COMMAND)
     if len(body) != 4:
-        raise _Refusal(_ASCII_ERROR)
+        raise Rejected(_ASCII_ERROR)
     byte, bit = divmod(int(body, 16), 8)
     place = _stretch(byte)
     if place is None or place.area not in _FORCED:
-        raise _Refusal(_OUT_OF_RANGE)
+        raise Rejected(_OUT_OF_RANGE)
     return b"", store.write([((place.area, place.devices(byte)[bit]), int(command == FORCE_ON))])
 
 
 def _places(body: bytes) -> list[tuple[Stretch, int]]:
     """Returns the bytes of a 51 or 61."""
     if len(body) < 6:
-        raise _Refusal(_ASCII_ERROR)
+        raise Rejected(_ASCII_ERROR)
     address, count = int(body[:4], 16), int(body[4:6], 16)
     if not 1 <= count <= MOST_BYTES:
-        raise _Refusal(_OUT_OF_RANGE)
+        raise Rejected(_OUT_OF_RANGE)
     places = []
     for byte in range(address, address + count):
         place = _stretch(byte)
         if place is None:
-            raise _Refusal(_OUT_OF_RANGE)
+            raise Rejected(_OUT_OF_RANGE)
         places.append((place, byte))
     return places
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.frames.codec import FrameCodec
@@ -12,7 +12,6 @@ from gateway.protocols.typed_fields import TypedField
 from gateway.values.numerals import Scalar
 
 LISTENED, WRITTEN = "listened", "written"
-_TRAITS = Traits(baudrate=9600, format="8N1", numbered=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +44,9 @@ class FrameDriver:
     _names: Mapping[str, tuple[str, ...]] = field(init=False, repr=False)  # fields, by area
     _places: Mapping[str, Address] = field(init=False, repr=False)  # by field
 
+    station: ClassVar = 0  # devices without a protocol have no number
+    traits: ClassVar = Traits(baudrate=9600, format="8N1", numbered=False)
+
     def __post_init__(self) -> None:
         settings = self.settings
         requests = {f"ask {request}": request for request in settings.ask}
@@ -75,15 +77,6 @@ class FrameDriver:
     @property
     def protocol(self) -> str:
         return self.settings.protocol
-
-    @property
-    def station(self) -> int:
-        """Devices without a protocol have no station number."""
-        return 0
-
-    @property
-    def traits(self) -> Traits:
-        return _TRAITS
 
     @property
     def timing(self) -> Timing:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from gateway.protocols.checksums import byte_sum
 from gateway.protocols.computer_link.codec import ALL_STATIONS, PC, Ack, Frame, Nak, Text
-from gateway.stations.computer_link.devices import Cells, Kind, No, Profile, limits, locate
-from gateway.stations.store import Cell, Denied, Store, Why, Written
+from gateway.stations.computer_link.devices import Cells, Kind, Profile, limits, locate
+from gateway.stations.store import Cell, Denied, Rejected, Store, Why, Written
 
 _BATCH = ("BR", "WR", "BW", "WW")
 _ENTRY = {"BT": 6, "WT": 9, "BM": 5, "WM": 5}  # characters of a device, with data where written
@@ -50,16 +50,16 @@ class Answer(NamedTuple):
 
 
 def parse(text: str, *, sum_check: bool) -> Request:
-    """Raises `No` 02, 03, 06."""
+    """Raises `Rejected` 02, 03, 06."""
     if sum_check:
         if byte_sum(text[:-2].encode("latin-1")).decode() != text[-2:]:
-            raise No("02")
+            raise Rejected("02")
         text = text[:-2]
     command, wait = text[4:6], text[6:7]
     if command not in _COMMANDS:
-        raise No("03")
+        raise Rejected("03")
     if not wait or wait not in _HEX:
-        raise No("06")
+        raise Rejected("06")
     return Request(int(text[:2], 16), text[2:4], command, int(wait, 16) * _STEP, text[7:])
 
 
@@ -102,7 +102,7 @@ class LinkStation:
                 return Answer(None)
             reply, written = self._carry_out(request)
             return Answer(reply, wait, "", request.command in _WRITES, written)
-        except No as refusal:
+        except Rejected as refusal:
             code = refusal.code
         except Denied:
             pass
@@ -119,10 +119,10 @@ class LinkStation:
         return ()
 
     def _carry_out(self, request: Request) -> tuple[Frame, Written]:
-        """Raises `No` in the order of the codes, and `Denied`."""
+        """Raises `Rejected` in the order of the codes, and `Denied`."""
         command, area = request.command, request.area
         if command in _BARE and area:
-            raise No("06")
+            raise Rejected("06")
         parts: list[tuple[Cells, Sequence[int]]] = []
         if command in _BATCH:
             parts = [self._batch(command, area)]
@@ -130,7 +130,7 @@ class LinkStation:
             parts = list(self._listed(command, area))
         data = self._data(command, area, [cells for cells, _ in parts])
         if request.pc != PC:
-            raise No("10")
+            raise Rejected("10")
         if data is not None:
             return Text(self.station, data), ()
         if command in ("BM", "WM"):
@@ -148,16 +148,16 @@ class LinkStation:
             case "TT":
                 count = _hex(area[:2])
                 if not 1 <= count <= self._limits.loopback or len(area) != 2 + count:
-                    raise No("06")
+                    raise Rejected("06")
                 if not (area.isascii() and area.isprintable()):
-                    raise No("07")
+                    raise Rejected("07")
                 return area
             case "PC" if self._model:
                 return self._model
             case "MB" | "MN" | "MW" | "PC":
                 listed = self._lists.get("BM" if command == "MB" else "WM")
                 if command == "PC" or not listed:
-                    raise No("06")
+                    raise Rejected("06")
                 return self._read(listed)
         return None
 
@@ -170,9 +170,9 @@ class LinkStation:
         cells = locate(area[:5], words, count)
         most = self._limits.write if writes else self._limits.read
         if not 1 <= count <= most[cells.kind]:
-            raise No("06")
+            raise Rejected("06")
         if len(area) != 7 + (cells.characters if writes else 0):
-            raise No("06")
+            raise Rejected("06")
         return cells, cells.decode(area[7:]) if writes else ()
 
     def _listed(self, command: str, area: str) -> Iterator[tuple[Cells, Sequence[int]]]:
@@ -182,11 +182,11 @@ class LinkStation:
             command, limit.monitored
         )
         if not 1 <= count <= most or len(area) != 2 + count * size:
-            raise No("06")
+            raise Rejected("06")
         entries = [area[at : at + size] for at in range(2, len(area), size)]
         places = [locate(entry[:5], command[0] == "W", 1) for entry in entries]
         if any(cells.kind is Kind.DWORDS for cells in places):
-            raise No("06")
+            raise Rejected("06")
         for cells, entry in zip(places, entries, strict=True):
             yield cells, cells.decode(entry[5:])
 
@@ -221,15 +221,15 @@ class LinkStation:
     def _remote(self, *, run: bool) -> Written:
         """Starts or stops the program: M8035 to M8037."""
         if self.running if run else self._ordered() is False:
-            raise No("18")
+            raise Rejected("18")
         try:
             written = self.flags(M8035=int(run), M8036=int(run), M8037=int(not run))
         except Denied:
-            raise No("18") from None
+            raise Rejected("18") from None
         return written if self.running else (*written, *self._global("0"))
 
 
 def _hex(text: str) -> int:
     if len(text) != 2 or not _HEX.issuperset(text):
-        raise No("06")
+        raise Rejected("06")
     return int(text, 16)

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from gateway.stations.store import Rejected
+
 Profile = Literal["liyan", "ex1s", "ex1n", "ex2n", "fx"]
 
 # profile: (last X and Y, last M, last D)
@@ -22,14 +24,6 @@ _LAST = {
 _BIT_AREAS = ("X", "Y", "M", "M8", "S")
 _CONTACTS = ("TS", "CS")
 _NAME = re.compile(r"([XY])([0-7]{4})|([MSD])([0-9]{4})|(TS|CS|TN|CN)([0-9]{3})")
-
-
-class No(Exception):
-    """The request is refused with this NAK code."""
-
-    def __init__(self, code: str) -> None:
-        super().__init__(code)
-        self.code = code
 
 
 class Kind(StrEnum):
@@ -124,7 +118,7 @@ class Cells:
     def decode(self, data: str) -> list[int]:
         legal = "[01]*" if self.kind is Kind.BITS else "[0-9A-F]*"
         if not re.fullmatch(legal, data):
-            raise No("07")
+            raise Rejected("07")
         digits = _DIGITS[self.kind]
         units = [int(data[i : i + digits], 16) for i in range(0, len(data), digits)]
         if self.kind is not Kind.SIXTEENS:
@@ -133,15 +127,15 @@ class Cells:
 
 
 def locate(name: str, in_words: bool, count: int) -> Cells:
-    """Returns `count` devices from the five-character `name` on. Raises `No` 06."""
+    """Returns `count` devices from the five-character `name` on. Raises `Rejected` 06."""
     area, number = _device(name)
     is_bit = area in _BIT_AREAS or area in _CONTACTS
     if in_words and is_bit:
         if area in _CONTACTS or number % 8:
-            raise No("06")
+            raise Rejected("06")
         return Cells(area, number, 16 * count, Kind.SIXTEENS)
     if in_words != (not is_bit):
-        raise No("06")
+        raise Rejected("06")
     kind = Kind.BITS if is_bit else Kind.DWORDS if area == "C32" else Kind.WORDS
     return Cells(area, number, count, kind)
 
@@ -149,7 +143,7 @@ def locate(name: str, in_words: bool, count: int) -> Cells:
 def _device(name: str) -> tuple[str, int]:
     match = _NAME.fullmatch(name)
     if match is None:
-        raise No("06")
+        raise Rejected("06")
     octal, octal_digits, letter, digits, pair, pair_digits = match.groups()
     if octal:
         return octal, int(octal_digits, 8)

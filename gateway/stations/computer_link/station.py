@@ -7,9 +7,10 @@ from collections.abc import Iterable
 
 from gateway.protocols.computer_link.codec import ALL_STATIONS, Frame, FrameFormat, LinkCodec, Text
 from gateway.stations.computer_link.answers import LinkStation, addressed, parse
-from gateway.stations.computer_link.devices import No, Profile, areas
+from gateway.stations.computer_link.devices import Profile, areas
 from gateway.stations.computer_link.requests import RequestReader
 from gateway.stations.station import Memory, MemoryStore
+from gateway.stations.store import Rejected
 
 _TIME_OUT = 0.1  # seconds, when D8129 is 0
 _DEDICATED, _SUM, _FORMAT_4 = 0x4000, 0x2000, 0x8000  # D8120 b14, b13, b15
@@ -92,7 +93,7 @@ class ComputerLinkStation:
         """Returns True for a sound request to all stations that is no GW."""
         try:
             return parse(text, sum_check=self.sum_check).command != "GW"
-        except No as refusal:
+        except Rejected as refusal:
             return refusal.code != "02"
 
     def _expire(self, now: float) -> None:

@@ -16,9 +16,9 @@ from gateway.protocols.modbus.frame import (
     WRITE_SINGLE,
 )
 from gateway.stations.modbus.dialects import Part, Runs, parts_of, runs_by_function
-from gateway.stations.store import Cell, Denied, Store, Why, Written
+from gateway.stations.store import Cell, Denied, Rejected, Store, Why, Written
 
-_ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE, _FAILURE = 1, 2, 3, 4
+_ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE, _FAILURE = "01", "02", "03", "04"
 MOST: Mapping[int, int] = {1: 2000, 2: 2000, 3: 125, 4: 125, 15: 1968, 16: 123}
 _WRITES = (*WRITE_SINGLE, *WRITE_MANY)
 
@@ -29,12 +29,6 @@ class Answer(NamedTuple):
     pdu: bytes
     refused: str = ""  # the exception code
     written: Written = ()
-
-
-class _Refusal(Exception):
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
 
 
 class ModbusData:
@@ -59,32 +53,32 @@ class ModbusData:
         function = pdu[0]
         try:
             return Answer(*self._serve(function, pdu))
-        except _Refusal as refusal:
-            code = refusal.code
+        except Rejected as rejected:
+            code = rejected.code
         except Denied as denied:
             code = _FAILURE if denied.why is Why.BAD else _ILLEGAL_ADDRESS
-        return Answer(bytes((function | EXCEPTION, code)), f"{code:02X}")
+        return Answer(bytes((function | EXCEPTION, int(code, 16))), code)
 
     def _serve(self, function: int, pdu: bytes) -> tuple[bytes, str, Written]:
-        """Raises `_Refusal`, `Denied`."""
+        """Raises `Rejected`, `Denied`."""
         runs = self._runs.get(function)
         if runs is None:
-            raise _Refusal(_ILLEGAL_FUNCTION)
+            raise Rejected(_ILLEGAL_FUNCTION)
         if function in _WRITES:
             wire, units = self._written(function, pdu)
             return pdu[:5], "", self._write(self._parts(runs, wire, len(units)), units)
         if len(pdu) != 5:
-            raise _Refusal(_ILLEGAL_VALUE)
+            raise Rejected(_ILLEGAL_VALUE)
         wire, count = unpack_from(">HH", pdu, 1)
         if not 1 <= count <= self._most[function]:
-            raise _Refusal(_ILLEGAL_VALUE)
+            raise Rejected(_ILLEGAL_VALUE)
         units = self._read(self._parts(runs, wire, count))
         return bytes((function,)) + _packed(function, units), "", ()
 
     def _parts(self, runs: Runs, wire: int, count: int) -> list[Part]:
         parts = list(parts_of(runs, wire, count))
         if sum(part.size for part in parts) != count:
-            raise _Refusal(_ILLEGAL_ADDRESS)
+            raise Rejected(_ILLEGAL_ADDRESS)
         return parts
 
     def _read(self, parts: Sequence[Part]) -> list[int]:
@@ -125,17 +119,17 @@ class ModbusData:
         return self._store.write(cells, (), {cell: bits for cell, bits in missing.items() if bits})
 
     def _written(self, function: int, pdu: bytes) -> tuple[int, list[int]]:
-        """Returns the wire address and the units of a write. Raises `_Refusal` 03."""
+        """Returns the wire address and the units of a write. Raises `Rejected` 03."""
         if len(pdu) < 5:
-            raise _Refusal(_ILLEGAL_VALUE)
+            raise Rejected(_ILLEGAL_VALUE)
         wire, second = unpack_from(">HH", pdu, 1)
         if function in WRITE_SINGLE:
             if len(pdu) != 5 or (function == 5 and second not in (0xFF00, 0)):
-                raise _Refusal(_ILLEGAL_VALUE)
+                raise Rejected(_ILLEGAL_VALUE)
             return wire, [int(second == 0xFF00) if function == 5 else second]
         size = (second + 7) // 8 if function == 15 else 2 * second
         if not 1 <= second <= self._most[function] or len(pdu) != 6 + size or pdu[5] != size:
-            raise _Refusal(_ILLEGAL_VALUE)
+            raise Rejected(_ILLEGAL_VALUE)
         if function == 15:
             return wire, [pdu[6 + i // 8] >> i % 8 & 1 for i in range(second)]
         return wire, list(unpack_from(f">{second}H", pdu, 6))
