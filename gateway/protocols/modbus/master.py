@@ -276,14 +276,30 @@ class Master(Settings):
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)
+        await self.ask(talk, request, 5, lambda heard: heard == request or None)
+
+    async def ask(
+        self, talk: Talk[Frame], request: bytes, longest: int, accept: Callable[[bytes], T | None]
+    ) -> T:
+        """Sends a request. `accept` returns the contents of its reply of at most `longest` bytes,
+        or None for another frame."""
         number = next(self._numbers) & 0xFFFF
 
-        def answers(heard: Frame) -> bool | None:
+        def answers(heard: Frame) -> T | None:
             if heard.station != self.station or heard.transaction != number:
                 return None
-            if heard.pdu == request:
-                return True
+            if (found := accept(heard.pdu)) is not None:
+                return found
             pdu.raise_refusal(heard.pdu, request[0])
             return None
 
-        await talk.ask(Frame(self.station, request, number), self.chars(5), answers)
+        return await talk.ask(Frame(self.station, request, number), self.chars(longest), answers)
+
+    @property
+    def identity_names(self) -> Collection[str]:
+        return NAMES if self.dialect.standard and not self.broadcast else ()
+
+    def identify(
+        self, talk: Talk[Frame], names: Collection[str]
+    ) -> Coroutine[Any, Any, Mapping[str, Sequence[str]]]:
+        return identify(self.ask, talk, names)
