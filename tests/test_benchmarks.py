@@ -83,6 +83,7 @@ TINY = [
     ("sim_speed", "--minutes 0.05", [r"^every +30 s: +[\d.]+ simulated hours per minute"]),
     ("start", "--sizes 1 2 5", [r"^\| different \| run: 10 tags answer in [\d.]+ s \| [\d.]+"]),
     ("transactions", "--count 2 --rounds 1", [r"^  ours, 64 tags, uvloop +[\d.]+"]),
+    ("upstream", "wildcards --seconds 1", [r"^after 1 s: \d+ MB$"]),
     (
         "web",
         "--seconds 0.2 --rounds 1 --lines 1",
@@ -90,6 +91,7 @@ TINY = [
     ),
 ]
 PICTURES = ["pictures", "--after", "0", "--into"]
+BY_OTHER_TESTS = {"moves", "structure"}  # tests/engine/test_structure.py
 PARTS_OF_OTHERS = {"__init__", "checkouts", "paced_wire", "plant_consumer", "words"}
 
 
@@ -114,4 +116,4 @@ def test_the_pictures_of_the_page_are_made(tmp_path: Path) -> None:
 
 def test_every_benchmark_is_run() -> None:
     found = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    assert found == {*(row[0] for row in TINY), "pictures", *PARTS_OF_OTHERS}
+    assert found == {*(row[0] for row in TINY), "pictures", *BY_OTHER_TESTS, *PARTS_OF_OTHERS}

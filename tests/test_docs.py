@@ -139,7 +139,15 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
+        *(
+            "first-plant.md",
+            "identity.md",
+            "import.md",
+            "peek.md",
+            "serve.md",
+            "shaping.md",
+            "systems.md",
+        ),
         *("modem.md", "transfers.md"),
         *("templates.md", "trace.md", "alarms.md", "arrays.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
