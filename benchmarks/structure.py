@@ -40,7 +40,9 @@ def fields(node: ast.ClassDef) -> int:
     found = {
         item.target.id
         for item in node.body
-        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
+        if isinstance(item, ast.AnnAssign)
+        and isinstance(item.target, ast.Name)
+        and not ast.unparse(item.annotation).startswith("InitVar")  # an argument, not a field
     }
     for item in ast.walk(node):
         if (

@@ -8,7 +8,7 @@ receive frames of the transaction it is given.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 from gateway.values import Kind, Order
 
@@ -16,13 +16,16 @@ from gateway.values import Kind, Order
 class Unit(StrEnum):
     """The contents of one address of an area."""
 
-    BIT = "bit"
-    WORD = "word"  # 16 bits
-    DWORD = "dword"  # 32 bits by nature: Vigor and FX counters from C200 on
+    BIT = "bit", 1
+    WORD = "word", 0xFFFF
+    DWORD = "dword", 0xFFFF_FFFF  # 32 bits by nature: Vigor and FX counters from C200 on
 
-    @property
-    def largest(self) -> int:
-        return {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFF_FFFF}[self]
+    largest: int  # of its values
+
+    def __new__(cls, text: str, largest: int) -> Self:
+        unit = str.__new__(cls, text)
+        unit._value_, unit.largest = text, largest
+        return unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.errors import BadValue, ConfigError, DeviceError, NoReply, Refusal, Refused
+from gateway.errors import BadValue, ConfigError, DeviceError, NoReply, Refusal, Refused, Took
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Address, Cost, Driver, Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
@@ -391,11 +391,15 @@ async def test_whatever_comes_back_is_units_or_a_device_error(
 async def test_a_write_is_acknowledged_by_its_own_address_and_value_only() -> None:
     driver, span = ModbusRtu(station=10), Span("holding", 0, 1)
     good = VECTORS["modbus-rtu-010"].frame
-    others = [bytes((6, 0, 1, 0x12, 0x34)), bytes((6, 0, 0, 0x12, 0x35)), bytes((16, 0, 0, 0, 1))]
+    others = [bytes((6, 0, 1, 0x12, 0x34)), bytes((16, 0, 0, 0, 1))]
     wrong = [framed(ModbusRtu, 10, body) for body in others]
     assert await driver.write(hearing(driver, [*wrong, good]), span, [0x1234]) is True
     with pytest.raises(NoReply):
         await driver.write(hearing(driver, wrong), span, [0x1234])
+    less = framed(ModbusRtu, 10, bytes((6, 0, 0, 0x12, 0x33)))  # a drive that limits a set point
+    with pytest.raises(Took) as caught:
+        await driver.write(hearing(driver, [less]), span, [0x1234])
+    assert caught.value.units == [0x1233]
 
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii, ModbusTcp])
