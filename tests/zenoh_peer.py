@@ -247,12 +247,13 @@ class ZenohPeer:
         return replies
 
     async def get_until(self, selector: str, fits: Callable[[Any], bool]) -> Any:
-        """Waits until the one document fits."""
+        """Waits until the one document is there and fits: a gateway that has just started does not
+        reply for a device before its claim counts."""
         async with asyncio.timeout(TIMEOUT):
             while True:
-                [reply] = await self.get(selector)
-                if fits(reply.json):
-                    return reply.json
+                for reply in await self.get(selector):
+                    if fits(reply.json):
+                        return reply.json
 
     async def many(
         self,
