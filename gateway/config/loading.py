@@ -139,6 +139,8 @@ def written(config: Config) -> Iterator[Written]:
     yield from writes(config.parts)
     if config.state_file is not None:
         yield Written(("gateway", "state"), config.state_file, _STATE, "state.json")
+    if config.held_file is not None and any(line.serve for line in config.lines):
+        yield Written(("gateway", "state"), config.held_file, _STATE, "state.json")
     if config.audit_file is not None:
         yield Written(("gateway", "audit"), config.audit_file, _AUDIT, "audit.jsonl")
     if config.writers_state is not None:

@@ -43,6 +43,11 @@ def _of_parts(documents: Documents) -> Iterator[str]:
     for part, document in below("parts/", documents):
         if document["why"]:
             yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
+    for file in documents.get("damaged", {"files": ()})["files"]:
+        yield (
+            f"{file} is a damaged file that was moved aside, and what it held is forgotten: remove "
+            "or rename it when you know"
+        )
     for part, document in below("files/", documents):
         if document["trouble"]:
             yield f"{part} not saved: {document['trouble']}; a restart forgets the last changes"

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from gateway.config.settings.sections import PartSection
     from gateway.plant.part import Kind
 
-PARTS = ("history", "audit", "state", "serving", "transfers", "alarms", "certificates", "web")
+PARTS = (
+    *("history", "audit", "state", "serving", "transfers", "alarms"),
+    *("certificates", "damaged_files", "web"),
+)
 
 
 def kinds() -> "list[tuple[str, Kind]]":

@@ -14,6 +14,7 @@ from gateway import files
 
 log = structlog.get_logger("gateway")
 T = TypeVar("T")
+ASIDE = ".bad"  # end of the name of a damaged file
 
 
 class SavedFile:
@@ -106,7 +107,7 @@ class SavedFile:
             return None
 
     def _move_aside(self, why: str) -> None:
-        aside = self._path.with_name(self._path.name + ".bad")
+        aside = self._path.with_name(self._path.name + ASIDE)
         try:
             self._path.replace(aside)
         except OSError as error:

@@ -144,6 +144,7 @@ POINTS = {
     "serving": ("run", "seen", "documents"),
     "transfers": ("run", "publish", "documents", "take_over"),
     "alarms": ("run", "seen", "documents", "retag", "take_over"),
+    "damaged_files": ("run", "documents"),
     "web": ("run",),
 }
 QUIET = {"certificates"}  # the file of this plant does not want it

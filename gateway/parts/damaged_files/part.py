@@ -1,0 +1,45 @@
+"""Watches for damaged files that were moved aside: what they held is lost, and a person must know.
+
+It looks at the folder, not at what this process did: the fault survives a restart.
+"""
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from gateway.config import Config
+from gateway.config.loading import written
+from gateway.plant.part import Core, Kind, Part, Phase
+from gateway.plant.saved_file import ASIDE
+from gateway.plant.threads import off_loop
+
+LOOK_EVERY = 2.0  # seconds
+
+
+class DamagedFilesPart:
+    """The files of `SavedFile` that lie beside the present ones."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._found: Sequence[str] = ()
+
+    async def run(self) -> None:
+        while True:
+            self._found = await off_loop(moved_aside, self._core.config)
+            await asyncio.sleep(LOOK_EVERY)
+
+    def documents(self) -> Mapping[str, Mapping[str, object]]:
+        return {"damaged": {"files": self._found}}
+
+
+def moved_aside(config: Config) -> list[str]:
+    """Returns the paths of the files that were moved aside. Blocks."""
+    files = [Path(f"{one.file}{ASIDE}") for one in written(config) if ASIDE in one.tails]
+    return [str(file) for file in files if file.is_file()]
+
+
+def _make(core: Core) -> Part | None:
+    return DamagedFilesPart(core)
+
+
+KIND = Kind(_make, Phase.SHOWING)
