@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from gateway.cli.terminal import err
-from gateway.config import Config, ConfigErrors, SheetUse, load
+from gateway.config import Config, ConfigErrors, SheetUse, built, load
+from gateway.config.loading import dumped
 from gateway.config.messages import one_of
 from gateway.config.sheets import devices_in, link_table, read_grid
 from gateway.config.sheets.link_table import Transferred
@@ -39,8 +40,20 @@ def import_(
             help="The rows of a PLC's communication table become transfers; DEVICE is that PLC.",
         ),
     ] = None,
+    serve: Annotated[
+        list[int] | None,
+        typer.Option(
+            metavar="STATION",
+            help="Print a served line in the place of this station of a PLC's communication table.",
+        ),
+    ] = None,
 ) -> None:
     """Import the tags of a sheet into the configuration. With a mistake nothing is written."""
+    if serve:
+        if into or device or transfers:
+            raise ConfigError("--serve prints a line: leave out --into, --device and --transfers")
+        print_served(sheet, serve)
+        return
     if transfers is not None:
         import_transfers(sheet, into, transfers)
         return
@@ -173,6 +186,35 @@ def import_transfers(sheet: Path, into: Path | None, master: str) -> None:
     replace(own, before, kept, lambda new: _check(new, own), backup_of(own))
     print(f"{into.name}: {len(found)} transfers of {sheet.name} added")
     print(f"the file before is {backup_of(into).name}")
+
+
+def print_served(sheet: Path, stations: Sequence[int]) -> None:
+    """Prints a line on which the gateway is these stations, and the PLC stays the master.
+
+    Raises `ConfigErrors` with every mistake; then nothing is printed.
+    """
+    grid = read_grid(read_file(sheet))
+    found = link_table.transfers_in(grid, lambda _, text: text)
+    if not found:
+        raise ConfigError(f"{sheet.name} is no communication table: see docs/import.md")
+    devices = {}
+    for station in dict.fromkeys(stations):
+        rows = [row.cells for row in link_table.of_station(grid, station).rows[1:]]
+        written = [row.slave for row in found if row.station == station and not row.reads]
+        devices[f"station-{station}"] = {
+            "protocol": "modbus-rtu" if ":" in rows[0][1] else "vigor",
+            "station": station,
+            "accept": [*dict.fromkeys(written)],
+            "tags": {
+                name: {"address": address, "description": comment}
+                | ({"write": True} if command == "r" else {})
+                for name, address, command, comment in rows
+            },
+        }
+    line = {"port": "/dev/ttyUSB0", "serve": True, "devices": devices}
+    built(data := {"lines": {"master-plc": line}})
+    print(dumped(data), end="")
+    err.print("set port, baudrate and format of the master; switch off the stations themselves")
 
 
 def _lines(found: Sequence[Transferred], names: dict[int, str], master: str) -> list[str]:
