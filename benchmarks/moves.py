@@ -109,7 +109,6 @@ def moves(calls: Sequence[Call]) -> int:
 
 def shortest() -> dict[str, list[Call]]:
     """The calls of one poll and of one write."""
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
     with process(sys.executable, "-c", VIGOR_STATION, "tcp") as where:
         engine = asyncio.run(record(int(where.rpartition(":")[2])))
     found: dict[str, list[Call]] = {}
@@ -124,6 +123,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--calls", action="store_true", help="print every call")
     show = parser.parse_args().calls
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
     for name, calls in shortest().items():
         entered = len({call.file for call in calls})
         print(f"{name:6} {entered:3} files entered, {moves(calls):3} moves between files")

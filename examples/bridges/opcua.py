@@ -38,6 +38,7 @@ NOT_DONE = {  # by the outcome of a write
     "bad-value": Code.BadOutOfRange,
     "unknown-tag": Code.BadNodeIdUnknown,
     "not-allowed": Code.BadUserAccessDenied,
+    "wrong-device": Code.BadConfigurationError,
     "busy": Code.BadTooManyOperations,
     "line-down": Code.BadNotConnected,
     "no-reply": Code.BadDeviceFailure,

@@ -213,7 +213,7 @@ class Builder:
             **{name: given for name, given in own_times.items() if given is not None},
             learn_silence=default.learn_silence and settings.silence is None,
         )
-        self._check_identity(settings.identity, driver, tags, (*path, "identity"))
+        self._check_identity(settings.identity or {}, driver, tags, (*path, "identity"))
         late_guard = settings.late_guard
         return DeviceSettings(
             name=name,
@@ -222,7 +222,7 @@ class Builder:
             turnaround=settings.turnaround,
             late_guard=timing.reply_timeout if late_guard is None else late_guard,
             verify_reads=settings.verify_reads,
-            identity=settings.identity,
+            identity=settings.identity or {},
             blocks=settings.blocks,
             control=settings.control,
             enabled=settings.enabled,

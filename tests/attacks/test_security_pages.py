@@ -172,7 +172,8 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "holds the line. [write-values.md](write-values.md#sign-a-write) shows how a program "
         "signs.": (STOLEN, SIGNED),
         "The file is read again within a second of a change. To withdraw a secret, delete its "
-        "line. If the file becomes unreadable, every write is refused.": (SIGNED,),
+        "line. If the file becomes unreadable, or its disk does not answer for ten seconds, "
+        "every write is refused.": (SIGNED,),
         "Then the gateway warns at every start, and `check` warns too.": (STOLEN,),
         # Records of writes
         "Every outcome of a write or command is logged, published on "
@@ -281,6 +282,11 @@ NO_PROMISES: dict[str, tuple[str, ...]] = {
         "Keep the interlocks in the PLC and in the wiring.",
     ),
     "docs/security.md": (
+        (
+            "One attack has no limit here: two key expressions with some 15 `**` each, of any "
+            "client that is connected, stop Zenoh 1.10.2 ([attacks](attacks.md#not-withstood)). "
+            "Only the [connection](#restrict-connections) protects against it."
+        ),
         (
             "How to decide who can connect, read and write. There are four levels, from the"
             " outside in:"

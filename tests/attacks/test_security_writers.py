@@ -98,7 +98,10 @@ async def test_only_writers_write_and_a_signature_counts_once_and_for_seconds(
             file.write_text(line)
             await bob.until("not-allowed")
             assert await alice.says(b"7", alice.signed(b"7")) == "ok"
-            quoted("If the file becomes unreadable, every write is refused.")
+            quoted(
+                "If the file becomes unreadable, or its disk does not answer for ten seconds, "
+                "every write is refused."
+            )
             file.unlink()
             await alice.until("not-allowed")
             secret(file, line)

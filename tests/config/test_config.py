@@ -505,8 +505,8 @@ DEVICES = [
         "another protocol's setting",
         on_mixer("protocol: vigor\nframe_format: 4"),
         f"7: {M}.frame_format: no setting of a vigor device: use accept, blocks, control, "
-        "defaults, enabled, format, late_guard, reply_timeout, retries, silence, stale_after, "
-        "station, tags, tags_from, turnaround or verify_reads",
+        "defaults, enabled, format, identity, late_guard, reply_timeout, retries, silence, "
+        "stale_after, station, tags, tags_from, turnaround or verify_reads",
     ),
     bad(
         "a protocol's own settings",

@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import count
+from queue import Empty
 from types import TracebackType
 from typing import Any
 
@@ -273,4 +274,9 @@ class SimpleQueue:
     def get(self) -> Any:
         while not self._items:
             self.turns.wait(self._waiting)
+        return self._items.popleft()
+
+    def get_nowait(self) -> Any:
+        if not self._items:
+            raise Empty
         return self._items.popleft()

@@ -46,7 +46,7 @@ class DeviceSection(Section):
     """The number of equal reads in a row before a value counts."""
     late_guard: Duration | None = None
     """The longest wait for a late reply after a time-out, before the next request."""
-    identity: Annotated[dict[str, str], Parsed(parsers.identity, IDENTITY_SCHEMA)] = {}
+    identity: Annotated[dict[str, str] | None, Parsed(parsers.identity, IDENTITY_SCHEMA)] = None
     """What the device must tell of itself: vendor, model, serial, or the value of a tag."""
     blocks: Annotated[
         bool | Literal["only"], Parsed(parsers.blocks, {"enum": [True, False, "only"]})
