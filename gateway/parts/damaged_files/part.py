@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gateway.config import Config
 from gateway.config.loading import written
-from gateway.plant.part import Core, Kind, Part, Phase
+from gateway.plant.part import Core, Kind, Phase
 from gateway.plant.saved_file import ASIDE
 from gateway.plant.threads import off_loop
 
@@ -38,8 +38,4 @@ def moved_aside(config: Config) -> list[str]:
     return [str(file) for file in files if file.is_file()]
 
 
-def _make(core: Core) -> Part | None:
-    return DamagedFilesPart(core)
-
-
-KIND = Kind(_make, Phase.SHOWING)
+KIND = Kind(DamagedFilesPart, Phase.SHOWING)
