@@ -592,6 +592,8 @@ def test_the_reply_to_an_unsolicited_frame_has_no_effect_on_its_device(
 ) -> None:
     rig = Rig(weighing_machine())
     assert rig.next() == Idle(inf)
+    rig.now = rig.engine.deadline  # the silence after the port was opened
+    rig.note(rig.engine.expire(rig.now, rig.time))
     rig.now = 1.0
     effects = rig.note(rig.engine.received(WEIGHED, rig.now, rig.time))
     assert kinds(effects) == "online+good"

@@ -43,6 +43,11 @@ class FrameReader:
         """The number of bytes kept: part of a frame, or still undecided."""
         return len(self._buffer)
 
+    @property
+    def aligned(self) -> bool:
+        """False until a silence, or the end of a frame, shows where the next one begins."""
+        return self._aligned
+
     def feed(self, data: bytes) -> list[bytes | Garbled]:
         """Returns the frames completed by `data`, and damage among them, in order.
 

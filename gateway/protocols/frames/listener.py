@@ -5,6 +5,8 @@ from gateway.protocols.frames.device import Frames
 from gateway.protocols.unsolicited import Stale, UnsolicitedEvent
 
 _QUIET = 0.05  # s; a byte after it begins a frame, where no header marks the begin
+_LATE = 0.01  # s; a tick that is later is asked again: bytes may have arrived, and wait
+_AGAIN = 4  # late ticks, one in each round of the event loop; then bytes that waited were read
 _LONGEST_PAUSE = 1.0  # s; discards half a frame where the framing has no gap: its rest is lost
 
 
@@ -13,6 +15,9 @@ class Listener:
 
     `Garbled` is damage, or a frame without an entry in `listen`: after it no field in `listen` is
     known until it is received again. A frame to ignore has a `listen` entry without fields.
+
+    Only a `tick` shows a silence, never the time of the next byte: that byte may have waited while
+    the process got no processor.
     """
 
     def __init__(self, device: Frames, now: float) -> None:
@@ -20,6 +25,7 @@ class Listener:
         self._device = device
         self._reader = device.reader(quiet=False)
         self._last_byte = now
+        self._late = 0  # late ticks since the last byte or silence
         self._stale_at: dict[str, float] = {}
         for one in device.listen.values():
             if one.stale_after is not None:
@@ -30,9 +36,16 @@ class Listener:
     def due(self) -> float | None:
         """The time of the next `tick`; None: not before bytes arrive."""
         times = list(self._stale_at.values())
-        if self._reader.pending:
-            times.append(self._last_byte + self._gap)
+        if (silent := self._silent_at) is not None:
+            times.append(silent)
         return min(times, default=None)
+
+    @property
+    def _silent_at(self) -> float | None:
+        """The time at which a silence means something."""
+        if not self._reader.aligned:
+            return self._last_byte + min(_QUIET, self._gap)
+        return self._last_byte + self._gap if self._reader.pending else None
 
     @property
     def busy_until(self) -> float | None:
@@ -54,8 +67,11 @@ class Listener:
 
     def received(self, data: bytes, now: float) -> list[UnsolicitedEvent]:
         """Decodes bytes that arrived at `now`."""
-        said = self._silence(now)
-        self._last_byte = now
+        said: list[UnsolicitedEvent] = []
+        if self._reader.pending and (self._silent_at or now) < now:
+            said.append(Garbled("its bytes may have waited", evidence=Evidence.TRUNCATED))
+            self._reader = self._device.reader(quiet=False)
+        self._last_byte, self._late = now, 0
         return said + self._events(self._reader.feed(data), now)
 
     def tick(self, now: float) -> list[UnsolicitedEvent]:
@@ -83,11 +99,17 @@ class Listener:
 
     def _silence(self, now: float) -> list[UnsolicitedEvent]:
         """Ends frames by the silence up to `now`, counted from the last byte."""
+        silent = self._silent_at
+        if silent is None or now < silent:
+            return []
+        if now > silent + _LATE and self._late < _AGAIN:
+            self._late += 1  # `due` has passed: it is asked again at once
+            return []
+        self._late = 0
         # Computed as in `due`: a difference of the same times could be less than the gap.
         if now >= self._last_byte + self._gap:
             return self._events(self._reader.expire(), now)
-        if now >= self._last_byte + _QUIET:
-            self._reader.settle()
+        self._reader.settle()
         return []
 
     def _events(self, frames: list[bytes | Garbled], now: float) -> list[UnsolicitedEvent]:
