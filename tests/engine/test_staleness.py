@@ -2,13 +2,15 @@
 
 import asyncio
 
+import pytest
+
 from gateway.engine.device.ages import polled_blocks, worst_ages
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.jobs.jobs import Poll, Resynced
 from gateway.errors import NoReply
 from gateway.tags import Quality, Reason
-from tests.engine.rig import Rig
+from tests.engine.rig import Rig, link_device
 from tests.sim.plant import Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
 
@@ -130,3 +132,27 @@ def test_a_poll_that_fails_brings_the_deadline_of_its_values() -> None:
     assert isinstance(poll, Poll)
     rig.conclude(poll, NoReply("no reply"))
     assert rig.engine.deadline <= rig.now + 2 * poll.block.every
+
+
+@pytest.mark.parametrize("failing", [True, False])
+def test_an_old_value_names_the_device_that_fails_and_the_log_says_it_once(failing: bool) -> None:
+    rig = Rig(link_device(), link_device(station=2))
+    for _ in rig.devices:
+        rig.conclude(rig.transacted(), Resynced(1))
+    for _ in rig.devices:
+        rig.conclude(rig.transacted(), [1, 2, 3, 4, 5, 6])
+    poll = rig.transacted()
+    [other] = [one for one in rig.devices if one is not poll.device]
+    if failing:
+        rig.fail(poll)
+        assert poll.device.health.state is State.FAILING
+    rig.samples.clear()
+    rig.now += 100.0
+    rig.note(rig.engine.expire(rig.now, rig.time))
+    details = {s.detail for s in rig.samples if s.reason is Reason.OVERDUE and s.tag in other.tags}
+    assert len(details) == 1
+    assert (f"{poll.device.name}, which fails" in details.pop()) == failing
+    logged = [event for event in rig.logged if event.event == "block overdue"]
+    assert ["others on the line" in str(event.fields) for event in logged] == [True] * (
+        0 if failing else 2
+    )

@@ -15,6 +15,7 @@ from gateway.tags import Reason
 
 LOG_EVERY = 60.0  # seconds for each device
 CAUSE = "others on the line, or writes, take its time"
+WAITS = "the line waits for {device}, which fails"  # the log says so of that device
 
 
 class Staleness(Rule):
@@ -85,9 +86,12 @@ class Staleness(Rule):
             self._effects.bad(poll.block.tags, device.health.reason, time, device.diagnosis())
             return
         device.record.count_overdue()
-        detail = f"not read for {age:.1f} s: {CAUSE}"
+        failing = (one for one in self._schedule.devices if one.health.state is State.FAILING)
+        other = next(failing, None)
+        cause = CAUSE if other is None else WAITS.format(device=other.name)
+        detail = f"not read for {age:.1f} s: {cause}"
         self._effects.bad(poll.block.tags, Reason.OVERDUE, time, detail)
-        if now - self._logged.get(device, -NEVER) >= LOG_EVERY:
+        if other is None and now - self._logged.get(device, -NEVER) >= LOG_EVERY:
             self._logged[device] = now
             block = describe(poll.block)
             self._effects.warning(
