@@ -283,6 +283,10 @@ NO_PROMISES: dict[str, tuple[str, ...]] = {
     ),
     "docs/security.md": (
         (
+            "If the file is damaged, this protection is lost for the present start, which is a "
+            "[fault](status.md#damaged)."
+        ),
+        (
             "One attack has no limit here: two key expressions with some 15 `**` each, of any "
             "client that is connected, stop Zenoh 1.10.2 ([attacks](attacks.md#not-withstood)). "
             "Only the [connection](#restrict-connections) protects against it."

@@ -5,6 +5,7 @@ It looks at the folder, not at what this process did: the fault survives a resta
 
 import asyncio
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from gateway.config import Config
@@ -25,7 +26,8 @@ class DamagedFilesPart:
 
     async def run(self) -> None:
         while True:
-            self._found = await off_loop(moved_aside, self._core.config)
+            with suppress(OSError):  # a disk that does not answer: what was known stays
+                self._found = await off_loop(moved_aside, self._core.config)
             await asyncio.sleep(LOOK_EVERY)
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
