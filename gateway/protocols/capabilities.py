@@ -139,7 +139,7 @@ class Identifies(Protocol[F]):
 
     @property
     def identity_names(self) -> Collection[str]:
-        """What it may tell: vendor, model, serial."""
+        """The names that it may tell: vendor, model, serial."""
 
     async def identify(self, talk: Talk[F], names: Collection[str]) -> Mapping[str, Sequence[str]]:
         """Returns all texts that the device tells for each of the names.

@@ -19,7 +19,7 @@ LONGEST_DELAY = 0.1  # seconds; the kernel shortens longer ones
 
 @dataclass(frozen=True, slots=True)
 class Rs485:
-    """How RTS switches the transceiver. Delays in seconds, whole milliseconds."""
+    """Rules by which RTS switches the transceiver. Delays in seconds, whole milliseconds."""
 
     rts_sends: bool = True  # RTS is on while the port sends; False: while it receives
     before: float = 0.0  # from switching to the first bit

@@ -1,1 +1,1 @@
-"""Who may do what: secrets, signatures, certificates."""
+"""Rights of clients: secrets, signatures, certificates."""

@@ -1,4 +1,4 @@
-"""What a Modbus device tells of itself: function 43/14, and 17 for what the maker adds."""
+"""The identity of a Modbus device: function 43/14, and 17 for the words of its maker."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
