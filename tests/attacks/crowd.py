@@ -59,10 +59,10 @@ async def _one(port: int, number: int) -> asyncio.StreamWriter | None:
 
 
 def curl(program: str, port: int, path: str) -> str:
-    """Returns the status and the seconds of an answer."""
+    """Returns the status and the seconds of an answer. A client asks again after a 503."""
     url = f"http://127.0.0.1:{port}{path}"
     words = ["-s", "-o", "/dev/null", "-w", "%{http_code} %{time_total}", url]
-    limit = ["--max-time", str(PATIENCE)]
+    limit = ["--max-time", str(PATIENCE), "--retry", "9", "--retry-delay", "1"]
     return subprocess.run(
         [program, *limit, *words], capture_output=True, text=True, check=False
     ).stdout

@@ -1,6 +1,7 @@
 """No client closes the gateway to the others: bounds of connections, requests and answers."""
 
 import asyncio
+import math
 import socket
 import threading
 from collections.abc import AsyncIterator, Iterator
@@ -12,7 +13,7 @@ from aiohttp import web
 
 from gateway.contract.interfaces import History
 from gateway.parts.web.connections import MOST_CONNECTIONS
-from gateway.parts.web.guard import MOST_OF_CLIENT
+from gateway.parts.web.guard import MOST_OF_CLIENT, MOST_OPEN
 from gateway.parts.web.routes import drop
 from gateway.tags import Sample
 from tests.history.recorded import SPEED
@@ -107,7 +108,10 @@ async def test_readers_of_history_close_the_gateway_to_nobody() -> None:
         assert await readers[0][0].readline() == b"HTTP/1.1 200 OK\r\n"
 
 
-async def test_clients_that_take_nothing_of_their_answers_close_the_gateway_to_nobody() -> None:
+async def test_clients_that_take_nothing_of_their_answers_close_the_gateway_to_nobody(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gateway.parts.web.connections.STALLED_AFTER", math.inf)
     async with serving() as client, AsyncExitStack() as stack, asyncio.timeout(300):
         client.north.changed["devices/mixer"] = LONG
         for _ in range(MOST_OF_CLIENT):
@@ -119,6 +123,26 @@ async def test_clients_that_take_nothing_of_their_answers_close_the_gateway_to_n
         async with connected(client, "/api/status", "127.0.0.2") as (reader, _):
             assert await reader.readline() == b"HTTP/1.1 200 OK\r\n"
         await all_answered(client, "127.0.0.1")
+
+
+async def test_the_place_of_the_answer_that_waits_longest_for_its_client_goes_to_a_new_request(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gateway.parts.web.connections.STALLED_AFTER", 0.0)
+    async with serving() as client, AsyncExitStack() as stack, asyncio.timeout(300):
+        client.north.changed["devices/mixer"] = LONG
+        readers = []
+        for number in range(MOST_OPEN):
+            by = f"127.0.1.{1 + number}"
+            reading = connected(client, "/api/devices/mixer", by, size=4096)
+            readers.append((await stack.enter_async_context(reading))[0])
+            assert await readers[-1].readline() == b"HTTP/1.1 200 OK\r\n"
+        async with connected(client, "/api/status", "127.0.0.2") as (reader, _):
+            assert await reader.readline() == b"HTTP/1.1 200 OK\r\n"
+        with pytest.raises((ConnectionResetError, asyncio.IncompleteReadError)):
+            await readers[0].readexactly(length_of(await readers[0].readuntil(b"\r\n\r\n")))
+        length = length_of(await readers[-1].readuntil(b"\r\n\r\n"))
+        assert await readers[-1].readexactly(length)
 
 
 async def test_a_client_that_takes_nothing_of_its_answer_is_dropped(

@@ -23,7 +23,7 @@ from gateway.contract.past.buckets import Now
 from gateway.contract.past.question import question
 from gateway.contract.payload import Problem
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.parts.web.connections import Places, client_of
+from gateway.parts.web.connections import Places
 from gateway.parts.web.guard import BY
 from gateway.parts.web.routes import (
     LIMIT,
@@ -264,7 +264,7 @@ class Api:
             except GatewayError as error:
                 return error
 
-        with self._history_places.taken(client_of(request.transport)):
+        with self._history_places.taken(request.transport):
             async with self._history_turns:
                 found = await off_loop(read)
         if isinstance(found, GatewayError):

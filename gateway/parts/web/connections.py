@@ -6,14 +6,17 @@ the client with the most connections: a client that opens thousands takes them f
 """
 
 import asyncio
+import math
 from collections import Counter
 from collections.abc import Iterator
+from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from typing import cast
 
 from aiohttp import web
 
 MOST_CONNECTIONS = 256
+STALLED_AFTER = 1.0  # seconds without a piece taken
 
 
 class Connections:
@@ -90,28 +93,52 @@ def client_of(transport: asyncio.BaseTransport | None) -> str:
     return str(peer[0]) if peer else ""
 
 
+class Place:
+    """The place of one request, or of one client's stream or search."""
+
+    def __init__(self, transport: asyncio.Transport | None) -> None:
+        self.client = client_of(transport)
+        self.untaken_since = math.inf  # loop time: a piece waits for the client; inf before that
+        self._transport = transport
+
+    def give_up(self) -> None:
+        """Closes the connection at once."""
+        if self._transport is not None:
+            self._transport.abort()
+
+
 class Places:
-    """A number of places, and how many of them one client may have."""
+    """A number of places, and how many of them one client may have.
+
+    When all are taken, or all of one client, a new request gets the place whose client has taken
+    nothing of its answer for the longest time, if that is `STALLED_AFTER` seconds or more.
+    """
 
     def __init__(self, most: int, of_client: int, called: str) -> None:
         """`called`: what takes them, such as `requests`."""
         self._most = most
         self._of_client = of_client
         self._called = called
-        self._taken: Counter[str] = Counter()
+        self._taken: set[Place] = set()
 
     @contextmanager
-    def taken(self, client: str) -> Iterator[None]:
+    def taken(self, transport: asyncio.Transport | None) -> Iterator[Place]:
         """Takes a place. Raises `HTTPServiceUnavailable` if there is none."""
-        if self._taken.total() >= self._most:
-            raise web.HTTPServiceUnavailable(reason=f"{self._most} {self._called} are open already")
-        if self._taken[client] >= self._of_client:
-            reason = f"{self._of_client} {self._called} of this address are open already"
-            raise web.HTTPServiceUnavailable(reason=reason)
-        self._taken[client] += 1
+        place = Place(transport)
+        self._make_room(self._taken, self._most, "are open already")
+        of_client = {one for one in self._taken if one.client == place.client}
+        self._make_room(of_client, self._of_client, "of this address are open already")
+        self._taken.add(place)
         try:
-            yield
+            yield place
         finally:
-            self._taken[client] -= 1
-            if not self._taken[client]:
-                del self._taken[client]
+            self._taken.discard(place)
+
+    def _make_room(self, taken: AbstractSet[Place], most: int, why: str) -> None:
+        if len(taken) < most:
+            return
+        stalled = min(taken, key=lambda one: one.untaken_since)
+        if asyncio.get_running_loop().time() - stalled.untaken_since < STALLED_AFTER:
+            raise web.HTTPServiceUnavailable(reason=f"{most} {self._called} {why}")
+        self._taken.remove(stalled)
+        stalled.give_up()

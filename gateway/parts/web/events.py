@@ -20,7 +20,7 @@ from aiohttp import web
 from gateway.contract import payload
 from gateway.contract.faults import Documents, below, transfers
 from gateway.parts.web.api import Api, overview
-from gateway.parts.web.connections import Places, client_of
+from gateway.parts.web.connections import Places
 from gateway.parts.web.routes import Route, Word, drop
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
@@ -118,7 +118,7 @@ class Events:
         if device := _DEVICE.of(request):
             tags = self._api.select(device, "", _AFTER.of(request), TAGS_SHOWN)
         with (
-            self._pages.taken(client_of(request.transport)),
+            self._pages.taken(request.transport),
             self.wires.watched(_LINE.of(request) or "") as recorder,
         ):
             response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})

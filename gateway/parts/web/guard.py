@@ -15,7 +15,7 @@ from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
 from gateway.contract.access.named_secrets import NamedSecrets
-from gateway.parts.web.connections import Connections, Places, client_of
+from gateway.parts.web.connections import Connections, Places
 from gateway.parts.web.routes import answer, send
 from gateway.parts.web.settings import WebSection
 
@@ -70,8 +70,8 @@ class Guard:
             return await send(request, await _outcome(request, handler))
         places = self._scrapes if request.path == "/metrics" else self._requests
         try:
-            with places.taken(client_of(request.transport)):
-                return await send(request, await _outcome(request, handler))
+            with places.taken(request.transport) as place:
+                return await send(request, await _outcome(request, handler), place)
         except web.HTTPServiceUnavailable as error:
             return await send(request, answer(error.status, error.reason))
 

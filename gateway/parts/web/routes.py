@@ -10,6 +10,7 @@ from dataclasses import KW_ONLY, dataclass, field
 import orjson
 from aiohttp import web
 
+from gateway.parts.web.connections import Place
 from gateway.parts.web.schemas import TEXT, Schema
 from gateway.plant.threads import off_loop
 
@@ -123,8 +124,13 @@ async def body(request: web.Request) -> bytes:
         raise web.HTTPBadRequest(reason="the body is not what its headers say") from None
 
 
-async def send(request: web.Request, found: web.StreamResponse) -> web.StreamResponse:
-    """Sends an answer in pieces. Closes the connection of a client that does not take one."""
+async def send(
+    request: web.Request, found: web.StreamResponse, place: Place | None = None
+) -> web.StreamResponse:
+    """Sends an answer in pieces. Closes the connection of a client that does not take one.
+
+    `place` then knows since when a piece waits.
+    """
     if found.prepared or not isinstance(found, web.Response):
         return found  # it was sent
     data = memoryview(found.body if isinstance(found.body, bytes) else b"")
@@ -135,6 +141,8 @@ async def send(request: web.Request, found: web.StreamResponse) -> web.StreamRes
         async with asyncio.timeout(PIECE_WITHIN) as limit:
             await sent.prepare(request)
             for start in range(0, len(data) if request.method != "HEAD" else 0, _PIECE):
+                if place is not None:
+                    place.untaken_since = loop.time()
                 await sent.write(data[start : start + _PIECE])
                 limit.reschedule(loop.time() + PIECE_WITHIN)
             await sent.write_eof()
