@@ -10,6 +10,7 @@ from typing import Any
 
 import zenoh
 
+import gateway.plant.threads as threads_module
 from tests.sim.threads import Condition, Event, Lock, Semaphore, SimpleQueue, Thread, Turns
 
 KINDS = (Thread, Lock, Condition, Event, Semaphore, SimpleQueue)
@@ -71,8 +72,10 @@ def replaced(
                         clocks.get(default, default) if callable(default) else default
                         for default in defaults
                     )
+    threads_module._spare.cache_clear()  # its queue is of this run
     try:
         yield
     finally:
+        threads_module._spare.cache_clear()
         for owner, name, old in reversed(undo):
             setattr(owner, name, old)
