@@ -241,7 +241,12 @@ def ask(endpoint: str, seconds: float) -> None:
         first = heard[0] if heard else None
         ended["silent" if first is None else "answered" if first.ok else "an error"] += 1
 
-    with zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))) as session:
+    config = configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))
+    # µs. Sooner its own session would close the link when the gateway does not receive for so long,
+    # and end all open queries without a reply.
+    waiting = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+    config.insert_json5(waiting, "60000000")
+    with zenoh.open(config) as session:
         asked, until = 0, time.monotonic() + seconds
         while time.monotonic() < until:
             for key, payload in keys:

@@ -13,8 +13,6 @@ from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 
-import pytest
-
 from benchmarks.northbound import Lag, memory
 from gateway.config import ZenohConfig
 from tests.e2e.processes import slowed
@@ -38,11 +36,6 @@ def other(*arguments: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
 
 
-@pytest.mark.xfail(
-    strict=False,
-    reason="on a machine with little processor time queries of the flood end without any reply; "
-    "the cause is not known yet",
-)
 async def test_a_flood_of_everything_costs_little_memory_and_no_poll() -> None:
     endpoint = free_endpoint()
     served = plant()

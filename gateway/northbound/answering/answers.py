@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 
 import structlog
 import zenoh
@@ -197,6 +197,9 @@ def _no_reply(_: zenoh.Query) -> None:
 class Workers:
     """At most `most` threads, which take the submitted work in turn.
 
+    A thread that takes work starts the next one if all are busy. Whoever submits waits for nothing,
+    not even for a lock: it may be Zenoh's thread, which receives for all clients.
+
     They are daemons, unlike those of `concurrent.futures`: the process ends although a reply still
     waits for its client.
     """
@@ -205,39 +208,42 @@ class Workers:
         self._most = most
         self._name = name
         self._work: SimpleQueue[Callable[[], object] | None] = SimpleQueue()  # None ends a thread
-        self._lock = threading.Lock()
-        self._idle = 0  # threads that wait for work
+        self._starting = threading.Lock()
         self._count = 0
-        self.submit(int)  # starts a thread: later the system may have none left
+        self._busy = set[int]()  # threads, by identifier
+        self._start()  # later the system may have none left
 
     def submit(self, function: Callable[..., object], *arguments: object) -> None:
         """Called by any thread; never waits."""
-        with self._lock:
-            self._work.put(partial(function, *arguments))
-            if self._idle or self._count >= self._most:
-                self._idle = max(0, self._idle - 1)
-                return
-            # Without more threads of the system those that run take the work in turn.
-            with suppress(RuntimeError):
-                threading.Thread(target=self._run, name=self._name, daemon=True).start()
-                self._count += 1
+        self._work.put(partial(function, *arguments))
 
     def end(self) -> None:
         """Ends each thread when it is idle."""
         self._work.put(None)
 
-    def _next(self) -> Callable[[], object] | None:
-        with self._lock:
-            with suppress(Empty):
-                return self._work.get_nowait()
-            self._idle += 1
-        return self._work.get()
+    def _start(self) -> None:
+        # Without more threads of the system those that run take the work in turn.
+        with suppress(RuntimeError):
+            threading.Thread(target=self._run, name=self._name, daemon=True).start()
+            self._count += 1
 
     def _run(self) -> None:
+        me = threading.get_ident()
         try:
-            while (work := self._next()) is not None:
+            while (work := self._work.get()) is not None:
+                self._busy.add(me)
+                self._grow()
                 work()
+                self._busy.discard(me)
             self._work.put(None)  # for the next thread
         finally:
-            with self._lock:
+            with self._starting:
+                self._busy.discard(me)
                 self._count -= 1
+
+    def _grow(self) -> None:
+        if len(self._busy) < self._count or self._count >= self._most:
+            return
+        with self._starting:
+            if len(self._busy) >= self._count < self._most:
+                self._start()
