@@ -35,7 +35,7 @@ from gateway.contract import payload
 from gateway.contract.access import certificates
 from gateway.contract.keys import Keys
 from gateway.contract.meta import meta
-from gateway.contract.payload import Problem
+from gateway.contract.problems import Problem
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.line.send_permit import Duty
 from gateway.northbound.group.standby import GroupSettings, Standby

@@ -15,7 +15,7 @@ from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
 from gateway.config import Config, load
 from gateway.contract import payload
-from gateway.contract.payload import Problem
+from gateway.contract.problems import Problem
 from gateway.errors import BadValue, ConfigError, GatewayError
 from gateway.tags import Tag
 from gateway.values import Kind, Value

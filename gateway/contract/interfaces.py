@@ -5,7 +5,8 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question
-from gateway.contract.payload import Failure, GroupResult
+from gateway.contract.payload import GroupResult
+from gateway.contract.problems import Failure
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty

@@ -10,12 +10,12 @@ beyond 2**53 a reader in JavaScript must parse them itself.
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import lru_cache
 
 import orjson
 
 from gateway import errors
+from gateway.contract.problems import PROBLEMS, Failure, Problem
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.tag import READ
@@ -26,53 +26,6 @@ from gateway.values.numerals import Scalar
 LONGEST_REASON = 300
 LOGGED_ELEMENTS = 128  # of a longer array the record has the beginning, as text
 _GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
-
-
-class Problem(StrEnum):
-    """The error words of the contract."""
-
-    NOT_WRITABLE = "not-writable"
-    BAD_VALUE = "bad-value"
-    REFUSED = "refused"  # by the device; `code` is its own
-    UNCLEAR = "unclear"  # the device may or may not have executed it
-    LINE_DOWN = "line-down"
-    NO_REPLY = "no-reply"  # the device is silent; nothing was sent
-    WRONG_DEVICE = "wrong-device"  # another device replies in its place; nothing was sent
-    BUSY = "busy"  # too many requests are waiting; nothing was done
-    UNKNOWN_TAG = "unknown-tag"
-    NOT_SENT = "not-sent"  # a tag of a group: another one was wrong, or not done before it
-    INCOMPLETE = "incomplete"  # of a group: some tags were written, and others were not
-    NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
-    NOTHING_TO_ACKNOWLEDGE = "nothing-to-acknowledge"  # the alarm is normal, or was raised again
-    BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
-    DAMAGED = "damaged"  # a part of the history file is lost; all the rest was answered
-    NO_HISTORY = "no-history"  # a read of the past from a gateway without history
-
-
-# Of the most special class of an error. All others are unclear.
-_PROBLEMS: Mapping[type, Problem] = {
-    errors.NotSent: Problem.NOT_SENT,
-    errors.BadValue: Problem.BAD_VALUE,
-    errors.Refused: Problem.REFUSED,
-    errors.LineDown: Problem.LINE_DOWN,
-    errors.Busy: Problem.BUSY,
-    errors.Offline: Problem.NO_REPLY,
-    errors.WrongDevice: Problem.WRONG_DEVICE,
-    errors.Damaged: Problem.DAMAGED,
-    errors.NoHistory: Problem.NO_HISTORY,
-    errors.Unknown: Problem.UNKNOWN_TAG,
-    errors.NotAllowed: Problem.NOT_ALLOWED,
-    errors.NothingToAcknowledge: Problem.NOTHING_TO_ACKNOWLEDGE,
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """A request that was not done, or whose result is unclear."""
-
-    problem: Problem
-    reason: str
-    code: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +82,7 @@ def failure(error: errors.GatewayError) -> Failure:
     """Translates an error for the client. An error after which the request may have been done is
     unclear."""
     kinds = type(error).__mro__
-    problem = next((_PROBLEMS[kind] for kind in kinds if kind in _PROBLEMS), Problem.UNCLEAR)
+    problem = next((PROBLEMS[kind] for kind in kinds if kind in PROBLEMS), Problem.UNCLEAR)
     code = error.code if isinstance(error, errors.Refused) else None
     return Failure(problem, str(error) or type(error).__name__, code)
 

@@ -15,7 +15,8 @@ from gateway.contract.access import secrets
 from gateway.contract.access.writers import Writers
 from gateway.contract.interfaces import Device, Parts, Plant
 from gateway.contract.keys import Keys
-from gateway.contract.payload import Failure, GroupResult
+from gateway.contract.payload import GroupResult
+from gateway.contract.problems import Failure
 from gateway.errors import Busy, GatewayError
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.group.admission import Admission

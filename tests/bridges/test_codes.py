@@ -2,7 +2,7 @@
 
 import re
 
-from gateway.contract.payload import Problem
+from gateway.contract.problems import Problem
 from gateway.tags import Reason
 from tests.e2e.processes import ROOT
 

@@ -16,7 +16,8 @@ from gateway.contract import payload
 from gateway.contract.interfaces import History
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import CommandResult
 from gateway.northbound.answering.answers import HISTORY_LIMIT
 from gateway.northbound.northbound import Northbound

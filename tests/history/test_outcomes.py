@@ -6,7 +6,8 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import CommandResult
 from gateway.tags import WriteResult
 from tests.history.recorded import (

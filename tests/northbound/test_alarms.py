@@ -11,7 +11,7 @@ import pytest
 from gateway.contract.access.signatures import sign
 from gateway.contract.access.writers import Writers
 from gateway.contract.keys import Family, Keys, parse_key, part_of
-from gateway.contract.payload import Failure
+from gateway.contract.problems import Failure
 from gateway.line.send_permit import Duty
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit

@@ -7,7 +7,8 @@ import pytest
 import structlog
 
 from gateway.contract import audited
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.contract.rate_limit import RateLimit
 from gateway.engine.jobs.requests import CommandResult
 from gateway.northbound.requests.audit import BURST, Audit

@@ -10,7 +10,7 @@ from structlog.testing import capture_logs
 
 from gateway.config.commands import NotControlled
 from gateway.contract.keys import Family, Keys, parse_key
-from gateway.contract.payload import Failure, Problem
+from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import LineDown
 from gateway.northbound.requests.acceptance import Acceptance, Sender

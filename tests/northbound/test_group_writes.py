@@ -9,7 +9,8 @@ import pytest
 from gateway.contract import payload
 from gateway.contract.keys import Keys
 from gateway.contract.parsing import LARGEST_GROUP, parse_group
-from gateway.contract.payload import Failure, GroupResult, Problem, WriteOutcome
+from gateway.contract.payload import GroupResult, WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.errors import BadValue, Busy, NoReply, Refused
 from gateway.line.send_permit import Duty
 from gateway.northbound.answering.tag_index import TagIndex

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from gateway.contract import payload
 from gateway.contract.meta import meta
 from gateway.contract.parsing import parse_write
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.errors import (
     BadValue,
     Busy,

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 from gateway.contract.faults import Documents
 from gateway.contract.interfaces import History
-from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.contract.payload import GroupResult
+from gateway.contract.problems import Failure, Problem
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web import metrics
 from gateway.parts.web.server import Server

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.contract.payload import GroupResult
+from gateway.contract.problems import Failure, Problem
 from gateway.parts.web.server import Server
 from gateway.tags import AlarmRule, Level, WriteResult, good
 from tests.history.recorded import SPEED, history

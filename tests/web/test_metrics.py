@@ -2,7 +2,8 @@
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web import metrics
 from gateway.tags import WriteResult

@@ -15,7 +15,8 @@ from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question, question
-from gateway.contract.payload import Failure, Problem, Result
+from gateway.contract.payload import Result
+from gateway.contract.problems import Failure, Problem
 from gateway.errors import BadValue, Busy, Damaged, GatewayError, NoHistory
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex

@@ -15,7 +15,8 @@ from typing import Protocol
 import structlog
 
 from gateway.contract import audited, payload
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.contract.rate_limit import RateLimit
 from gateway.engine.jobs.requests import CommandResult
 from gateway.tags import WriteResult

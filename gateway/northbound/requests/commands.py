@@ -13,7 +13,8 @@ from gateway.config.commands import TO_ALL, NotControlled
 from gateway.contract import payload
 from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Keys
-from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import BadValue, GatewayError
 from gateway.northbound.requests.acceptance import Acceptance, Sender

@@ -8,7 +8,8 @@ import zenoh
 
 from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Keys
-from gateway.contract.payload import Failure, GroupResult
+from gateway.contract.payload import GroupResult
+from gateway.contract.problems import Failure
 from gateway.northbound.answering.queries import Queries, StatusDocuments
 from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex

@@ -20,7 +20,8 @@ from gateway.contract import payload
 from gateway.contract.interfaces import Plant
 from gateway.contract.keys import Keys, parse_key
 from gateway.contract.parsing import parse_group, parse_write, parsed
-from gateway.contract.payload import Failure, GroupResult, Problem, WriteOutcome
+from gateway.contract.payload import GroupResult, WriteOutcome
+from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import BadValue, Busy, GatewayError, Unknown
 from gateway.northbound.answering.tag_index import TagIndex

@@ -6,7 +6,7 @@ from functools import partial
 from aiohttp import web
 
 from gateway.contract import payload
-from gateway.contract.payload import Failure, Problem
+from gateway.contract.problems import Failure, Problem
 from gateway.errors import BadValue
 from gateway.parts.web.guard import BY
 from gateway.parts.web.routes import LIMIT, Choice, Route, Word, answer, body, json_off_loop, raw

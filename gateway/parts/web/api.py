@@ -21,7 +21,7 @@ from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Now
 from gateway.contract.past.question import question
-from gateway.contract.payload import Problem
+from gateway.contract.problems import Problem
 from gateway.errors import BadValue, Busy, GatewayError
 from gateway.parts.web.connections import Places
 from gateway.parts.web.guard import BY
