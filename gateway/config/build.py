@@ -159,6 +159,8 @@ class Builder:
             wire=wire,
             echo=line.echo,
             modem=modem,
+            connect_delay=line.connect_delay,
+            close_after=line.close_after or "",
             listen_only=line.listen_only,
             serve=line.serve,
             request_gap=request_gap(line, dials=modem is not None),

@@ -14,6 +14,7 @@ from gateway.stations.registry import can_simulate
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
     ModemAddress,
+    Rfc2217Address,
     SerialPath,
     SerialSettings,
     SimulatorAddress,
@@ -22,6 +23,7 @@ from gateway.transport.port import (
 from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
 DIALS_IDLE, ANSWERS_IDLE = 5.0, 60.0  # seconds without an exchange until a call is ended
+LONGEST_CONNECT_DELAY = 10.0  # seconds
 _TEXT = 20  # characters, more than the modem's own text NO CARRIER with its line ends
 _LATE = 0.05  # seconds by which an adapter may delay a part of it
 
@@ -39,6 +41,7 @@ def check_line(
         mistakes.add((*path, "request_gap"), text)
     if line.listen_only:
         _check_listening(line, devices, path, mistakes)
+    _check_connection(line, devices, path, mistakes)
     for device in devices:
         driver, place = device.driver, (*path, "devices", device.name)
         if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):
@@ -118,6 +121,30 @@ def _check_unsolicited(devices: Sequence[DeviceSettings], path: Path, mistakes: 
             "say which device sent it: give this device a line of its own, or write both as one "
             "device",
         )
+
+
+def _check_connection(
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """A connection that comes and goes must suit the port, the devices and their intervals."""
+    delay, rounds, place = line.connect_delay, line.close_after, (*path, "close_after")
+    for setting in ("connect_delay", "close_after"):
+        if getattr(line, setting) and not isinstance(line.port, TcpAddress | Rfc2217Address):
+            text = "is a setting of a port tcp:// or rfc2217://: no other has a connection"
+            mistakes.add((*path, setting), f"{setting} {text}")
+    if delay > LONGEST_CONNECT_DELAY:
+        text = f"a delay is at most {LONGEST_CONNECT_DELAY:g}s: requests wait for it"
+        mistakes.add((*path, "connect_delay"), text)
+    if rounds and (line.serve or line.listen_only):
+        mistakes.add(place, "another master decides when this line speaks: remove close_after")
+    for device in devices if rounds else ():
+        if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited:
+            text = f"{device.name} sends unsolicited frames, which a closed connection loses"
+            mistakes.add(place, text)
+        short = min((tag.every for tag in device.wire_tags if tag.polled), default=2 * delay)
+        if short < 2 * delay:
+            text = f"{device.name} has an interval of {short:g} s, and each round waits {delay:g} s"
+            mistakes.add(place, f"{text} (connect_delay): write every: {2 * delay:g}s or more")
 
 
 def _check_listening(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.device.records import COMPLETE, CallState
+from gateway.engine.device.records import COMPLETE, CallRecord, CallState
 from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
 from gateway.engine.jobs.poll_entry import PollEntry
@@ -20,9 +20,11 @@ NEVER = float("inf")
 class CallRules:
     """Times in seconds."""
 
-    tries: int = 3  # failed calls in a row until the values turn bad
+    tries: float = 3  # failed calls in a row until the values turn bad
     retry_pause: float = 10.0  # between two calls
     idle: float = 5.0  # without an exchange, until the call is ended
+    rounds: bool = False  # the calls are connections: there is no telephone
+    early: float = 0.0  # from the call to the first request
 
 
 class DialSchedule:
@@ -37,11 +39,12 @@ class DialSchedule:
     * A call that breaks off in the middle of its work is a failed one, and a lost port for the
       values and requests.
     * Each call begins with a resync of every device: another station may have taken the call.
+    * A connection (`rounds`) needs no resync, and may end whenever no poll is due.
     """
 
     def __init__(self, engine: Engine, rules: CallRules) -> None:
         self.failed = 0  # calls in a row
-        self.record = engine.record.telephone()
+        self.record = CallRecord() if rules.rounds else engine.record.telephone()
         engine.reach_by_modem()
         self._engine = engine
         self._rules = rules
@@ -55,7 +58,7 @@ class DialSchedule:
     def due(self, now: float) -> float:
         """Returns the time to dial."""
         wanted = now if self.failed or self._is_wanted else self._next_interval()
-        return max(wanted, self._not_before)
+        return max(wanted - self._rules.early, self._not_before)
 
     @property
     def _is_wanted(self) -> bool:
@@ -83,7 +86,8 @@ class DialSchedule:
         engine = self._engine
         effects = [] if engine.is_open else engine.opened(now)
         for device in engine.devices:
-            device.health.reconnected()
+            if not self._rules.rounds:
+                device.health.reconnected()
             if device.identity is not None:
                 device.identity.doubt(now)
             device.monitor.forget()
@@ -128,6 +132,7 @@ class DialSchedule:
         `working`: it broke off during a transaction.
         """
         was_connected = self.record.state is CallState.CONNECTED
+        working = working and not self._rules.rounds
         self.record.enter(CallState.IDLE, now)
         self._ended, self._not_before = now, now + self._rules.retry_pause
         if why is None or (was_connected and not working and not self._is_busy(now)):

@@ -5,10 +5,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
-from gateway.engine.dial_schedule import CallRules, DialSchedule
+from gateway.engine.dial_schedule import NEVER, CallRules, DialSchedule
 from gateway.engine.effects import Effect
 from gateway.errors import CallEnded, LineDown
 from gateway.line.channel import Channel
+from gateway.line.rounds import ConnectionOpener
 from gateway.transport import (
     ModemAddress,
     ModemSettings,
@@ -23,10 +24,7 @@ from gateway.transport.port import SerialSettings
 
 @runtime_checkable
 class CallPort(Port, Protocol):
-    """The port of a modem, also between calls."""
-
-    @property
-    def modem(self) -> ModemSettings: ...
+    """The port of a modem, also between calls; or of connections, between rounds."""
 
     async def dial(self) -> None:
         """Returns when the carrier is there. Raises `CallEnded`, and `LineDown`."""
@@ -49,14 +47,23 @@ class ModemOpener:
 
 
 def dialling(opener: Callable[[Receiver], Awaitable[Port]]) -> float:
-    """Returns the seconds that a request may wait for a telephone call; 0: there is no modem."""
-    return opener.modem.dial_timeout if isinstance(opener, ModemOpener) else 0.0
+    """Returns the seconds that a request may wait for a telephone call, or a connection."""
+    match opener:
+        case ModemOpener(modem=modem):
+            return modem.dial_timeout
+        case ConnectionOpener(delay=delay, rounds=True):
+            return delay
+    return 0.0
 
 
-def rules_of(port: CallPort) -> CallRules:
-    """Returns the rules of its calls."""
-    modem = port.modem
-    return CallRules(tries=modem.tries, retry_pause=modem.retry_pause, idle=modem.idle)
+def rules_of(opener: Callable[[Receiver], Awaitable[Port]]) -> CallRules | None:
+    """Returns the rules of its calls; None: its port stays open."""
+    match opener:
+        case ModemOpener(modem=modem):
+            return CallRules(tries=modem.tries, retry_pause=modem.retry_pause, idle=modem.idle)
+        case ConnectionOpener(delay=delay, rounds=True):
+            return CallRules(tries=NEVER, retry_pause=1.0, idle=0.0, rounds=True, early=delay)
+    return None
 
 
 class CallingLine(Protocol):

@@ -223,8 +223,9 @@ class Line:
             log.info("line open", line=name)
             self.deliver(self.engine.opened(_now()))
             self.tried.set()
-            if isinstance(port, CallPort):
-                self.calls = DialSchedule(self.engine, rules_of(port))
+            rules = rules_of(self._open_port)
+            if rules is not None and isinstance(port, CallPort):
+                self.calls = DialSchedule(self.engine, rules)
                 await serve_calls(self, port, self.calls)
             await self.serve(channel)
         except LineDown as error:

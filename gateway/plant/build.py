@@ -10,6 +10,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.line.calling import ModemOpener
 from gateway.line.line import Line, SampleSink
+from gateway.line.rounds import ConnectionOpener
 from gateway.line.send_permit import Duty
 from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
@@ -68,6 +69,8 @@ def opener(line: LineConfig) -> OpenPort:
     prepare(line.port)
     if isinstance(line.port, ModemAddress) and line.modem is not None:
         return ModemOpener(line.port, line.serial, line.modem)
+    if line.connect_delay or line.close_after:
+        return ConnectionOpener(line.port, line.serial, line.connect_delay, bool(line.close_after))
     return lambda receiver: open_port(line.port, line.serial, receiver)
 
 

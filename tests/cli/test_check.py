@@ -156,3 +156,11 @@ def test_check_counts_telephone_calls(
     assert "the values turn bad after 207 s (3 tries)" in text
     assert warning in done.err
     assert ("warning" in done.err) is bool(warning)
+
+
+def test_check_says_how_long_a_connection_takes(command: Command, tmp_path: Path) -> None:
+    far = vigor_line("tcp://127.0.0.1:4001", {"level": {"address": "D100", "every": "5s"}})
+    lines = {"far": {**far, "close_after": "round", "connect_delay": "1500ms"}}
+    done = command("check", write_config(tmp_path / "c.yaml", free_endpoint(), lines))
+    text = " ".join(done.out.split())
+    assert "line far connects for each round and each write: each takes 1.5 s longer" in text

@@ -342,7 +342,7 @@ LINES = [
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
         "use port, baudrate, format, echo, rs485, serve, request_gap, listen_only, modem, "
-        "defaults or devices",
+        "connect_delay, close_after, defaults or devices",
     ),
     bad(
         "negative baud rate",
@@ -357,6 +357,26 @@ LINES = [
         "server has its own",
         "4: lines.hall.rs485.after: Linux waits whole milliseconds, at most 100ms: write 0ms, 1ms, "
         "2ms",
+    ),
+    bad(
+        "connections of a port that has none",
+        on_line("port: /dev/ttyS3\nclose_after: round\nconnect_delay: 11s\n"
+                "devices: {mixer: {protocol: vigor}}"),
+        "4: lines.hall.close_after: close_after is a setting of a port tcp:// or rfc2217://: no "
+        "other has a connection",
+        "5: lines.hall.connect_delay: connect_delay is a setting of a port tcp:// or rfc2217://: "
+        "no other has a connection",
+        "5: lines.hall.connect_delay: a delay is at most 10s: requests wait for it",
+    ),
+    bad(
+        "rounds that another master decides, and whose delay is longer than a round",
+        on_line("port: tcp://10.0.0.7:4001\nlisten_only: true\nclose_after: round\n"
+                "connect_delay: 2s\n"
+                "devices: {mixer: {protocol: vigor, tags: {t: {address: D1, every: 3s}}}}"),
+        "5: lines.hall.close_after: another master decides when this line speaks: remove "
+        "close_after",
+        "5: lines.hall.close_after: mixer has an interval of 3 s, and each round waits 2 s "
+        "(connect_delay): write every: 4s or more",
     ),
     bad(
         "port number",

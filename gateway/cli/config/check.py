@@ -54,8 +54,8 @@ def check(
     for part in _without_polls(loaded):
         out.print(part)
     by_name = {line.name: line for line in lines}
-    modems = [(line, by_name.get(line.name)) for line in loaded.lines if line.modem is not None]
-    for line, forecast in modems:
+    calling = [line for line in loaded.lines if line.modem is not None or line.close_after]
+    for line, forecast in ((line, by_name.get(line.name)) for line in calling):
         out.print(Text(modem_plan(line, forecast)))
         warnings += [] if forecast is None else modem_warnings(line, forecast)
     if loaded.transfers:

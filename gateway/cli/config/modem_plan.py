@@ -11,10 +11,11 @@ HOUR = 3600.0
 
 
 def modem_plan(line: LineConfig, forecast: LineForecast | None) -> str:
-    """Describes the calls of a line with a modem. Without `forecast` it answers calls."""
+    """Describes the calls or connections of a line. Without `forecast` a modem answers calls."""
     modem = line.modem
     if modem is None:
-        return ""
+        more = f"each takes {line.connect_delay:g} s longer than above (connect_delay)"
+        return f"line {line.name} connects for each round and each write: {more}"
     if forecast is None:
         idle = f"{modem.idle:g} s without a byte"
         return f"line {line.name} answers calls, and hangs up after {idle}"

@@ -99,6 +99,10 @@ class LineSection(Section):
     """true: learns the values from another master's traffic, and sends nothing, ever."""
     modem: ModemSection | None = None
     """The modem of a port `modem:…`, and its calls: docs/modem.md."""
+    connect_delay: Duration = 0.0
+    """From the connection to the first request, for a slow device server; at most 10s."""
+    close_after: Literal["round"] | None = None
+    """round: connects when polls are due or a client asks, and closes after them."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""

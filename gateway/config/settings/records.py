@@ -30,6 +30,8 @@ class LineConfig:
     serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
     request_gap: float | None = None  # seconds within a request of that master; None: by the speed
     modem: ModemSettings | None = None  # with a modem at the port
+    connect_delay: float = 0.0  # seconds from the connection to the first request
+    close_after: str = ""  # "round": connected only while polls are due
     listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]
 
@@ -72,11 +74,11 @@ class Config:
 
     @property
     def dialling(self) -> Mapping[str, float]:
-        """The devices behind a modem: seconds that a request may wait for a telephone call."""
+        """Seconds that a request may wait for a telephone call or a connection, by device."""
         return {
-            device.name: line.modem.dial_timeout
+            device.name: line.connect_delay if line.modem is None else line.modem.dial_timeout
             for line in self.lines
-            if line.modem is not None
+            if line.modem is not None or line.close_after
             for device in line.devices
         }
 
