@@ -28,6 +28,7 @@ format: .venv/ready
 
 schema: .venv/installed
 	$(BIN)/plc-gateway schema > config.schema.json
+	$(BIN)/python -m benchmarks.schemas
 
 bench: .venv/ready
 	$(BIN)/python -m benchmarks.bus_use

@@ -58,6 +58,7 @@ class Device:
     name: str
     tags: list[Tag]
     blocks: bool | Literal["only"] = False
+    control: bool = False
 
 
 @dataclass

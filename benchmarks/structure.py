@@ -160,9 +160,10 @@ def crowded(least: int = 40, most: int = 300) -> list[str]:
 
 
 def is_settings(file: str, node: ast.ClassDef) -> bool:
-    """Frozen dataclasses and models of the file are settings records."""
+    """Frozen dataclasses and models of the file are settings records; so are types of documents,
+    which have no state."""
     frozen = any("frozen=True" in ast.unparse(decorator) for decorator in node.decorator_list)
-    return frozen or file.startswith("config/")
+    return frozen or file.startswith(("config/", "contract/documents/"))
 
 
 def classes() -> list[tuple[int, int, str]]:

@@ -61,7 +61,7 @@ OF_DEVICES = "no-protocol.md"
 # The pages whose Python programs run here against the example gateway.
 OF_PROGRAMS = (
     *("read-values.md", "slow-links.md", "write-values.md", "write-groups.md"),
-    "browse.md",
+    *("browse.md", "contract.md"),
 )
 # The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.
@@ -560,7 +560,13 @@ def _example_keys() -> set[str]:
             for command in commands
         ),
         *(keys.status(f"lines/{line.name}/{TO_ALL}") for line in config.lines),
-        *(keys.claim("1a2b"), keys.late, f"{keys.group('hall')}/**"),
+        *(
+            keys.describe,
+            keys.introspect,
+            keys.claim("1a2b"),
+            keys.late,
+            f"{keys.group('hall')}/**",
+        ),
     }
 
 

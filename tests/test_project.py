@@ -48,7 +48,12 @@ def test_the_changelog_begins_with_the_version() -> None:
 def test_the_package_is_typed() -> None:
     assert "Typing :: Typed" in PROJECT["project"]["classifiers"]
     data = PROJECT["tool"]["setuptools"]["package-data"]["gateway"]
-    assert data == ["py.typed", "config/templates/shipped/*.yaml", "parts/web/assets/*"]
+    assert data == [
+        "py.typed",
+        "contract/documents/*.json",
+        "config/templates/shipped/*.yaml",
+        "parts/web/assets/*",
+    ]
     assert resources.files("gateway").joinpath("py.typed").is_file()
 
 

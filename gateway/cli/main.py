@@ -149,9 +149,18 @@ def options(
     """Declares the options before the command."""
 
 
-def schema() -> None:
+def schema(
+    contract: Annotated[
+        bool, typer.Option("--contract", help="Of the documents on Zenoh.")
+    ] = False,
+) -> None:
     """Print the JSON schema of the configuration file."""
-    print(json.dumps(config.schema(), indent=2))
+    if contract:
+        from gateway.contract.documents.catalogue import described
+
+        print(described().decode(), end="")
+    else:
+        print(json.dumps(config.schema(), indent=2))
 
 
 def version() -> None:

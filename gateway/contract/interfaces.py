@@ -29,6 +29,10 @@ class Device(Protocol):
     def blocks(self) -> bool | Literal["only"]:
         """True: each scan is also published as one `@block`. "only": single values are not."""
 
+    @property
+    def control(self) -> bool:
+        """Commands are permitted."""
+
 
 class Plant(Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""

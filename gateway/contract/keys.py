@@ -14,6 +14,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/@gateway/<name>/audit/…    the records of its audit, by time
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
     <prefix>/@gateway/<name>/lines/<line>/@trace    the exchanges of a line, while it is watched
+    <prefix>/@gateway/<name>/@describe, @introspect    schemas; keys and rights
     <prefix>/@gateway/<name>/page     the last reply to a query with `page`
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
@@ -24,11 +25,12 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from gateway.config.settings import parsers
 from gateway.errors import BadValue, ConfigError
 
+CONTRACT: Final = 1  # the number of the contract: docs/contract.md
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?)(ms|s|min|m|h|d|)\Z")
 _SECONDS = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -44,10 +46,12 @@ class Family(StrEnum):
     STATUS = "status"
     COMMAND = "command"
     PEEK = "peek"
+    SELF = "self"  # what the gateway says of itself
 
 
 _BY_LAST_CHUNK = {"@set": Family.SET, "@meta": Family.META, "@block": Family.BLOCK}
 _BY_LAST_CHUNK["@peek"] = Family.PEEK
+_BY_LAST_CHUNK |= dict.fromkeys(("@describe", "@introspect"), Family.SELF)
 _BY_LAST_CHUNK |= dict.fromkeys(("@run", "@stop", "@loopback", "@model"), Family.COMMAND)
 
 
@@ -132,6 +136,16 @@ class Keys:
     @property
     def statuses(self) -> str:
         return f"{self.own}/**"
+
+    @property
+    def describe(self) -> str:
+        """The JSON Schema of every document. No wildcard matches it, nor the next one."""
+        return f"{self.own}/@describe"
+
+    @property
+    def introspect(self) -> str:
+        """What this gateway serves."""
+        return f"{self.own}/@introspect"
 
     @property
     def writes(self) -> str:

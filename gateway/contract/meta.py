@@ -3,6 +3,7 @@
 import orjson
 
 from gateway.config.tags.registry import FEATURES
+from gateway.contract.keys import CONTRACT
 from gateway.tags import Tag
 
 
@@ -14,6 +15,7 @@ def meta(tag: Tag) -> bytes:
 def meta_fields(tag: Tag) -> dict[str, object]:
     read = tag if tag.origin.kept is None else tag.origin.inputs[0]
     found: dict[str, object] = {
+        "contract": CONTRACT,
         "type": tag.value_type,
         "raw_type": str(read.layout.type),
         "length": tag.layout.type.count or None,

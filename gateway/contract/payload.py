@@ -15,6 +15,16 @@ from functools import lru_cache
 import orjson
 
 from gateway import errors
+from gateway.contract.documents.requests import (
+    CommandDocument,
+    FailureDocument,
+    GroupDocument,
+    Logged,
+    OutcomeDocument,
+    OutcomeWord,
+    WrittenDocument,
+)
+from gateway.contract.documents.values import KnownValue, UnknownValue, ValueDocument
 from gateway.contract.problems import PROBLEMS, Failure, Problem
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.tags import Quality, Reason, Sample, WriteResult
@@ -147,12 +157,14 @@ def outcome(result: Result) -> bytes:
         case bytes():
             return result
         case GroupResult(ends, took):
-            failed = result.failure
-            whole = {} if failed is None else _result(failed)
             tags = {short(name): _result(end) for name, end in ends.items()}
-            return orjson.dumps({**whole, "tags": tags, "took": round(took, 6)})
+            whole: GroupDocument = {"tags": tags, "took": round(took, 6)}
+            if (failed := result.failure) is not None:
+                whole = {**_failure(failed), **whole}
+            return orjson.dumps(whole)
         case CommandResult(answer, at, took):
-            return orjson.dumps({"answer": answer, "time": rfc3339(at), "took": round(took, 6)})
+            told = CommandDocument(answer=answer, time=rfc3339(at), took=round(took, 6))
+            return orjson.dumps(told)
         case Peeked():
             return orjson.dumps({**result._asdict(), "time": rfc3339(result.time)})
         case _:
@@ -168,14 +180,14 @@ def failed(result: Result) -> Failure | None:
 
 def write_outcome(ended: WriteOutcome) -> bytes:
     """One line of the audit trail; `outcome` is its `word`."""
-    line: dict[str, object] = {
+    line: OutcomeDocument = {
         "key": short(ended.key),
         "value": loggable(ended.value),
         "time": rfc3339(ended.time),
         "took": round(ended.took, 6),
         "by": ended.by,
+        "outcome": word(ended.result),
     }
-    line["outcome"] = word(ended.result)
     match ended.result:
         case WriteResult(verified=verified, origin=origin):
             line["verified"] = verified
@@ -184,11 +196,11 @@ def write_outcome(ended: WriteOutcome) -> bytes:
         case CommandResult(answer):
             line["answer"] = short(answer)
         case Failure(_, reason, code):
-            line |= {"code": code, "reason": short(reason)}
+            line["code"], line["reason"] = code, short(reason)
     return orjson.dumps(line)
 
 
-def word(result: WriteResult | CommandResult | Failure) -> str:
+def word(result: WriteResult | CommandResult | Failure) -> OutcomeWord:
     """`written`, `obeyed` or a `Problem`."""
     match result:
         case WriteResult():
@@ -196,7 +208,7 @@ def word(result: WriteResult | CommandResult | Failure) -> str:
         case CommandResult():
             return "obeyed"
         case Failure(problem):
-            return problem.value
+            return problem
 
 
 def document(fields: Mapping[str, object]) -> bytes:
@@ -204,42 +216,48 @@ def document(fields: Mapping[str, object]) -> bytes:
     return orjson.dumps(fields, default=str, option=orjson.OPT_NON_STR_KEYS)
 
 
-def sample_fields(sample: Sample) -> dict[str, Value | None]:
-    fields: dict[str, Value | None] = {"value": sample.value}
-    if sample.quality is Quality.GOOD and _has_json(sample.value):
+def sample_fields(sample: Sample) -> ValueDocument:
+    fields: ValueDocument
+    time, value = rfc3339(sample.time), sample.value
+    if sample.quality is Quality.GOOD and value is not None and _has_json(value):
+        fields = known = KnownValue(value=value, quality="good", time=time)
         names = sample.tag.shaping.names
-        if names is not None and (text := names.text(sample.value)) is not None:
-            fields["text"] = text
-        fields |= {"quality": "good", "time": rfc3339(sample.time)}
+        if names is not None and (text := names.text(value)) is not None:
+            known["text"] = text
     else:
-        reason = Reason.NOT_A_NUMBER if sample.quality is Quality.GOOD else sample.reason
-        known = None if reason is None else reason.value
-        time = rfc3339(sample.time)
-        fields = {"value": None, "quality": "bad", "reason": known, "time": time}
+        reason = sample.reason or Reason.NOT_A_NUMBER
+        fields = unknown = UnknownValue(value=None, quality="bad", reason=reason, time=time)
         if sample.detail:
-            fields["detail"] = short(sample.detail)
+            unknown["detail"] = short(sample.detail)
     if (origin := sample.tag.origin.word) is not None:
         fields["origin"] = origin
     return fields
 
 
-def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
+def _result(result: WriteResult | Failure) -> WrittenDocument | FailureDocument:
     match result:
         case WriteResult(known, time, took, verified, acknowledged, note, origin):
-            fields: dict[str, Value | None] = {
+            fields: WrittenDocument = {
                 "value": known,
                 "time": rfc3339(time),
                 "verified": verified,
                 "acknowledged": acknowledged,
                 "took": round(took, 6),
             }
-            more = {"note": note or None, "origin": origin}
-            return fields | {name: one for name, one in more.items() if one is not None}
-        case Failure(problem, reason, code):
-            return {"error": problem.value, "code": code, "reason": short(reason)}
+            if note:
+                fields["note"] = note
+            if origin is not None:
+                fields["origin"] = origin
+            return fields
+        case Failure():
+            return _failure(result)
 
 
-def loggable(requested: Value | None) -> Scalar | list[Scalar] | None:
+def _failure(failed: Failure) -> FailureDocument:
+    return {"error": failed.problem, "code": failed.code, "reason": short(failed.reason)}
+
+
+def loggable(requested: Value | None) -> Logged | None:
     """Limits a requested value to a printable size; orjson writes at most 64 bits."""
     if isinstance(requested, tuple):
         found = list(map(_loggable, requested))

@@ -3,6 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from gateway.contract.documents.state import (
+    BlockReads,
+    CallsDocument,
+    DeviceDocument,
+    IdentityDocument,
+    LineDocument,
+)
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.identity import Identity
@@ -28,7 +35,7 @@ def standing(device: Device) -> str:
     return _STANDING.get(state, state.value)
 
 
-def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> Document:
+def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> DeviceDocument:
     """One device. Times in seconds, counts since the start. `now` by the loop's clock."""
     record, turnaround = device.record, device.record.replies.turnaround
     read = [at for poll in polls if (at := poll.reads.at) is not None]
@@ -64,12 +71,12 @@ def device_document(device: Device, polls: Sequence[PolledBlock], now: float) ->
     }
 
 
-def _identity(identity: Identity) -> Document:
+def _identity(identity: Identity) -> IdentityDocument:
     told = {name: list(texts[:MOST_TOLD]) for name, texts in identity.told.items()}
-    return {"verdict": identity.verdict.value, "wanted": dict(identity.wanted), "told": told}
+    return {"verdict": identity.verdict, "wanted": dict(identity.wanted), "told": told}
 
 
-def _request(poll: PolledBlock) -> Document:
+def _request(poll: PolledBlock) -> BlockReads:
     """One block: its configured interval and the measured one."""
     record = poll.reads
     return {
@@ -91,7 +98,7 @@ def refused_sentence(device: Device, bad: BadRange) -> str:
 
 def line_document(
     engine: Engine, expected: LineForecast, calls: DialSchedule | None, now: float
-) -> Document:
+) -> LineDocument:
     """One line: the forecast and the measured figures. `now` by the loop's clock."""
     record = engine.record
     open_for = now - record.since if engine.is_open else 0.0
@@ -127,12 +134,12 @@ def line_document(
     }
 
 
-def calls_document(record: CallRecord, calls: DialSchedule | None, now: float) -> Document:
+def calls_document(record: CallRecord, calls: DialSchedule | None, now: float) -> CallsDocument:
     """The telephone calls of a line. `calls`: of a modem that dials, and is there."""
     waits = calls is not None and record.state is CallState.IDLE
     dials_at = calls.due(now) if calls is not None and waits else math.inf
     return {
-        "state": record.state.value,
+        "state": record.state,
         "since": None if record.since is None else round(now - record.since, 1),
         "next": round(max(0.0, dials_at - now), 1) if dials_at < math.inf else None,
         "connected": record.state is CallState.CONNECTED,

@@ -11,6 +11,7 @@ from gateway.config import Config, LineConfig
 from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.contract.faults import below
+from gateway.contract.keys import CONTRACT
 from gateway.contract.status import Document, device_document, line_document
 from gateway.engine.device.device import Device
 from gateway.engine.device.device_settings import DeviceSettings
@@ -314,6 +315,7 @@ class Plant:
         now = asyncio.get_running_loop().time()
         documents: dict[str, Document] = {
             "status": {
+                "contract": CONTRACT,
                 "name": self.config.name,
                 "version": __version__,
                 "time": rfc3339(self._wall()),

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import structlog
 
 from gateway.config import Config
+from gateway.contract.documents.state import PartDocument
 from gateway.contract.interfaces import History, Keyed, North
 from gateway.errors import Busy, GatewayError
 from gateway.plant.part import (
@@ -175,7 +176,7 @@ class Bulkhead:
             raise Busy(f"{self.name} stopped: {self.why}")
         return self.part
 
-    def document(self) -> Mapping[str, object]:
+    def document(self) -> PartDocument:
         """`again`: seconds until a stopped part is tried again."""
         again = None
         if self.why:

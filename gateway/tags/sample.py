@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from gateway.errors import Garbled
-from gateway.tags.tag import Tag
+from gateway.tags.tag import OriginWord, Tag
 from gateway.values import Value
 
 
@@ -67,7 +67,7 @@ class WriteResult(NamedTuple):
     verified: bool = False  # read back and found equal
     acknowledged: bool = True  # False only for a broadcast: no device acknowledges it
     note: str = ""  # what the client must know of the way in which it was written
-    origin: str | None = None  # simulated: no real device holds the value
+    origin: OriginWord | None = None  # simulated: no real device holds the value
 
 
 def has_value(sample: Sample) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
@@ -55,6 +55,9 @@ class Label:
     description: str = ""
 
 
+OriginWord = Literal["simulated", "computed"]
+
+
 @dataclass(frozen=True, slots=True)
 class Origin:
     """The origin of the values, where it is not the words at the address."""
@@ -69,7 +72,7 @@ class Origin:
     simulated: bool = False  # by a line with `port: simulator`
 
     @property
-    def word(self) -> str | None:
+    def word(self) -> OriginWord | None:
         """Returns the word of the contract; None: a plain reading of a device."""
         if self.simulated:
             return "simulated"

@@ -71,7 +71,7 @@ def test_sound_samples_come_back_before_those_of_the_new_file(tmp_path: Path, pl
         with pytest.raises(GatewayError, match="stop the gateway"):
             salvage(path)
     with history(path) as historian:  # a fault after a restart too
-        assert len(historian.document()["aside"]) == 1  # type: ignore[arg-type]
+        assert len(historian.document()["aside"]) == 1
     back = salvage(path)
     assert is_intact(path)
     with history(path) as historian:

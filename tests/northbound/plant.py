@@ -44,6 +44,7 @@ class PlainDevice:
     name: str
     tags: tuple[Tag, ...]
     blocks: bool | Literal["only"] = False
+    control: bool = False
 
 
 class PlainPlant:

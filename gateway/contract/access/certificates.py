@@ -9,7 +9,8 @@ from pathlib import Path
 
 from gateway import files
 from gateway.config import TlsConfig
-from gateway.contract.faults import Document, certificate_fault
+from gateway.contract.documents.state import CertificateDocument
+from gateway.contract.faults import certificate_fault
 from gateway.errors import ConfigError
 from gateway.tags.timestamps import rfc3339
 
@@ -42,7 +43,7 @@ def expiries(tls: TlsConfig) -> list[str]:
     return [one for one in found if one]
 
 
-def document(file: Path, found: float | str, now: float) -> Document:
+def document(file: Path, found: float | str, now: float) -> CertificateDocument:
     """Returns the status document of a certificate.
 
     `found`: when it expires, or why that is unknown. Times in seconds since 1970.

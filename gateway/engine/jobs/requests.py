@@ -11,6 +11,7 @@ from gateway.protocols.capabilities import Controllable
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.tags import Tag, WriteResult
 from gateway.tags.decoding import Part
+from gateway.tags.tag import OriginWord
 from gateway.values import Value
 
 WRITE_EXPIRY = 5.0  # seconds after which a waiting request is no longer sent
@@ -75,7 +76,7 @@ class Write:
     group: Group | None = None
     masked: bool = False  # the device changes the bits of its word by itself
     part: Part | None = field(init=False)  # of its word, which it changes; None: whole words
-    origin: str | None = field(init=False)  # of its values, as users see it
+    origin: OriginWord | None = field(init=False)  # of its values, as users see it
     races: bool = field(init=False)  # bits around it are written as they were read
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
     long: LongWrite | None = field(init=False, default=None)  # None: one request is enough

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import orjson
 import zenoh
 
+from gateway.contract.documents.values import PageDocument
 from gateway.errors import BadValue, Damaged
 from gateway.tags import Tag
 from gateway.tags.recorded import Place
@@ -74,7 +75,7 @@ def end(
 ) -> bytes:
     """Returns the last document of a page; `last`: the tag or the place of its last reply."""
     place = last if isinstance(last, str) else "-".join(map(str, last))
-    document: dict[str, object] = {
+    document: PageDocument = {
         "samples": count,
         "complete": complete,
         "next": f"{gateway}:{place}",

@@ -100,6 +100,8 @@ class Queries:
                 self._take_keyed(query, part, parsed, at)
             case Family.STATUS:
                 self._take_status(query)
+            case Family.SELF:
+                self._reads.answer(query, self._replies.own)
             case Family.VALUE if is_of_past(query.parameters):
                 history = partial(self._replies.history, parsed, time.time_ns())
                 self._reads.answer_history(query, history)

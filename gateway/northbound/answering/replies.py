@@ -8,6 +8,8 @@ from itertools import islice
 import zenoh
 
 from gateway.contract import payload
+from gateway.contract.documents.catalogue import described
+from gateway.contract.documents.introspection import introspection
 from gateway.contract.interfaces import History, Parts, Plant
 from gateway.contract.keys import Family, Keys, ParsedKey
 from gateway.contract.meta import meta
@@ -47,6 +49,7 @@ class Replies:
     _index: TagIndex
     _stamp: Callable[[], zenoh.Timestamp]
     _parts: Parts
+    _signed: bool  # requests need the signature of a writer
     _ended: bool = False
     _turns: Turns = field(default_factory=Turns)
     _clock: Callable[[], float] = time.monotonic
@@ -277,6 +280,26 @@ class Replies:
         for key, document in documents.items():
             if query.key_expr.intersects(key):
                 self._reply(query, key, document, self._stamp())
+
+    def own(self, query: zenoh.Query) -> None:
+        """Replies with what the gateway says of itself."""
+        if query.key_expr.intersects(self._keys.describe):
+            self._reply(query, self._keys.describe, described(), self._stamp())
+        if query.key_expr.intersects(self._keys.introspect):
+            found = introspection(
+                self._keys,
+                self._plant.devices(),
+                self._plant.commands(),
+                signed=self._signed,
+                history=self._has_history(),
+            )
+            self._reply(query, self._keys.introspect, payload.document(found), self._stamp())
+
+    def _has_history(self) -> bool:
+        try:
+            return self._parts.history() is not None
+        except Busy:  # it does not work now
+            return True
 
     def outcome(self, result: Result, query: zenoh.Query) -> None:
         data = payload.outcome(result)

@@ -39,7 +39,7 @@ class Admission:
         self._second = SecondSession(config)
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
-        return self.standby.documents() | self.claiming.documents()
+        return {**self.standby.documents(), **self.claiming.documents()}
 
     def sessions(self) -> list[zenoh.Session]:
         """Sessions of tokens; the gateway's own may be one of them."""

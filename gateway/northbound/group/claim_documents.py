@@ -1,6 +1,6 @@
 """The documents of claims, signed with the secret of the plant.
 
-    {"ticket": …, "group": …, "devices": […], "signature": …}
+    {"contract": 1, "ticket": …, "group": …, "devices": […], "signature": …}
 
 The signature covers the key too, which has the names of the gateway and of its session.
 """
@@ -8,8 +8,9 @@ The signature covers the key too, which has the names of the gateway and of its 
 import orjson
 import structlog
 
+from gateway.contract.documents.state import ClaimDocument
 from gateway.contract.foreign import Foreign
-from gateway.contract.keys import Keys
+from gateway.contract.keys import CONTRACT, Keys
 from gateway.contract.rate_limit import RateLimit
 from gateway.errors import BadValue
 from gateway.northbound.group.claims import LAST_TICKET, Claim
@@ -43,10 +44,16 @@ class ClaimDocuments:
         """The claim has ended."""
         self._refused.pop(key, None)
 
-    def document(self, claim: Claim) -> dict[str, object]:
-        document = _unsigned(claim)
+    def document(self, claim: Claim) -> ClaimDocument:
+        # The number is not signed: a gateway of an earlier version does not know it.
+        document: ClaimDocument = {
+            "contract": CONTRACT,
+            "ticket": claim.ticket,
+            "group": claim.group,
+            "devices": sorted(claim.devices),
+        }
         if self._secret is not None:
-            text = _text(self._keys.claim(claim.session), document)
+            text = _text(self._keys.claim(claim.session), _unsigned(claim))
             document["signature"] = self._secret.signature(text)
         return document
 

@@ -12,6 +12,7 @@ from itertools import islice
 import structlog
 import zenoh
 
+from gateway.contract.documents.state import ClaimDocument
 from gateway.contract.keys import Keys
 from gateway.northbound.group.claim_documents import ClaimDocuments
 from gateway.northbound.group.claims import MOST_OTHERS, Claims
@@ -86,7 +87,7 @@ class Claiming:
             await off_loop(token.undeclare)
             await self._declare(session)
 
-    def documents(self) -> dict[str, dict[str, object]]:
+    def documents(self) -> dict[str, ClaimDocument]:
         """The own claim, by its path."""
         own = None if self._claims is None else self._claims.own
         if own is None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import structlog
 import zenoh
 
+from gateway.contract.documents.state import StandbyDocument
 from gateway.contract.keys import Keys
 from gateway.contract.rate_limit import RateLimit
 from gateway.line.send_permit import Duty
@@ -65,7 +66,7 @@ class Standby:
         self._tokens: dict[Role, zenoh.LivelinessToken] = {}
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
 
-    def documents(self) -> dict[str, dict[str, object]]:
+    def documents(self) -> dict[str, StandbyDocument]:
         """The status document; none without a standby group."""
         if not self.enabled:
             return {}

@@ -98,6 +98,11 @@ class Acceptance:
         self._accepted = accepted
         self._wall = wall
 
+    @property
+    def signed(self) -> bool:
+        """Requests need the signature of a writer."""
+        return self._writers is not None
+
     def begin(self) -> None:
         """Call it when the gateway becomes active."""
         if self._writers is not None:

@@ -9,12 +9,13 @@ write that was sent.
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Protocol
 
 import structlog
 
 from gateway.contract import audited, payload
+from gateway.contract.documents.state import OutcomesDocument
 from gateway.contract.payload import WriteOutcome
 from gateway.contract.problems import Failure, Problem
 from gateway.contract.rate_limit import RateLimit
@@ -57,7 +58,7 @@ class Counts:
             self._times[next((end for end in TIMES if outcome.took <= end), math.inf)] += 1
             self._seconds += outcome.took
 
-    def document(self) -> Mapping[str, object]:
+    def document(self) -> OutcomesDocument:
         """`took`: how many took at most so many seconds."""
         took, so_far = {}, 0
         for end in TIMES:

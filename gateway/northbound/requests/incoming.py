@@ -1,11 +1,12 @@
 """Everything that clients send to this gateway: queries and puts, from declaration to end."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import TypeVar
 
 import zenoh
 
+from gateway.contract.documents.state import OutcomesDocument
 from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import GroupResult
@@ -54,7 +55,7 @@ class Incoming:
             counted["puts_refused"] = self._puts.refused
         return counted
 
-    def outcomes(self) -> Mapping[str, object]:
+    def outcomes(self) -> OutcomesDocument:
         """Counts of writes and commands by outcome, and their times."""
         return self._audit.counts.document()
 
@@ -77,7 +78,8 @@ class Incoming:
         stamp = session.new_timestamp
         writes = Writes(self._plant, self._index, self._audit, self._acceptance)
         commands = Commands(self._keys, self._plant, self._audit, self._acceptance)
-        replies = Replies(self._keys, self._plant, self._index, stamp, self._parts)
+        signed = self._acceptance.signed
+        replies = Replies(self._keys, self._plant, self._index, stamp, self._parts, signed)
         orders = Orders(self._keys, self._parts, self._audit, self._acceptance)
         self._queries = Queries(
             self._plant,
@@ -142,7 +144,7 @@ class Declarations:
 
     def status(self) -> None:
         """Declares the status keys; a standby gateway answers them too."""
-        self._declare([self._keys.statuses])
+        self._declare(self._status_keys())
 
     def plant(self) -> None:
         """Declares values, writes and commands; only the active gateway answers them.
@@ -160,12 +162,15 @@ class Declarations:
         """Declares the keys of other devices, and undeclares those that no device has any more."""
         wanted = self._plant_keys()
         self._declare(wanted)
-        for key in self._queryables.keys() - {*wanted, self._keys.statuses}:
+        for key in self._queryables.keys() - {*wanted, *self._status_keys()}:
             self._queryables.pop(key).undeclare()  # type: ignore[no-untyped-call]  # as above
 
     def token(self) -> None:
         """Declares the gateway's liveliness token."""
         self._others.append(self._session.liveliness().declare_token(self._keys.own))
+
+    def _status_keys(self) -> list[str]:
+        return [self._keys.statuses, self._keys.describe, self._keys.introspect]
 
     def _plant_keys(self) -> list[str]:
         """Returns the keys of values, writes and commands; those of a line are status keys."""

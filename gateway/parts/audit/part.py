@@ -10,6 +10,7 @@ from pathlib import Path
 import orjson
 import structlog
 
+from gateway.contract.documents.requests import AuditNote
 from gateway.contract.interfaces import Keyed
 from gateway.contract.past import timerange
 from gateway.errors import Busy, Unknown
@@ -47,7 +48,7 @@ class AuditPart:
         self._waiting.append(Event(at, event))
         self._changed.set()
 
-    def _add(self, event: Mapping[str, object]) -> None:
+    def _add(self, event: AuditNote) -> None:
         self._waiting.append(Event(time.time_ns(), orjson.dumps(event).decode()))
         self._changed.set()
 

@@ -2,13 +2,14 @@
 
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from heapq import merge
 from itertools import islice
 from os.path import realpath
 from pathlib import Path
 from typing import TypeVar
 
+from gateway.contract.documents.state import HistoryDocument
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.question import Question
 from gateway.contract.past.timerange import TimeRange, time_range
@@ -80,7 +81,7 @@ class Historian:
         """Records one change of an alarm, as JSON; `time`: ns since 1970."""
         self._alarms.add(time, change)
 
-    def document(self) -> Mapping[str, object]:
+    def document(self) -> HistoryDocument:
         """The status document: `state` is `ok` or one sentence; counts since the start."""
         recent = self._recent
         oldest = min((run.first for run in recent.sorted_runs), default=None)

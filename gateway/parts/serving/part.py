@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Iterable, Mapping
 from math import isinf
 
+from gateway.contract.documents.state import DeviceDocument, LineDocument
 from gateway.contract.status import Document, calls_document
 from gateway.line.wire_log import WireLog
 from gateway.parts.serving.served_line import ServedLine
@@ -65,7 +66,7 @@ def served_documents(lines: Iterable[ServedLine], now: float) -> dict[str, Docum
     return found
 
 
-def _station(station: Station, now: float) -> Document:
+def _station(station: Station, now: float) -> DeviceDocument:
     """One station. The fields of polls are empty: it sends no request."""
     counts, driver = station.counts, station.driver
     return {
@@ -96,7 +97,7 @@ def _station(station: Station, now: float) -> Document:
     }
 
 
-def _line(line: ServedLine, now: float) -> Document:
+def _line(line: ServedLine, now: float) -> LineDocument:
     record = line.record
     open_for = 0.0 if line.opened is None else now - line.opened
     asked = sum(station.counts.requests for station in line.stations.values())

@@ -9,6 +9,7 @@ from functools import partial
 
 import structlog
 
+from gateway.contract.documents.state import TransferDocument
 from gateway.errors import GatewayError
 from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
@@ -208,7 +209,7 @@ class Transfers:
         """Returns the documents of all rows, by path."""
         return {f"{FOLDER}/{one.rule.number}": self._document(one) for one in self._running}
 
-    def _document(self, one: _Running) -> Document:
+    def _document(self, one: _Running) -> TransferDocument:
         source = one.source
         if source is None:
             raise AssertionError(f"{one.name} has ended")

@@ -24,7 +24,7 @@ from gateway.parts.web.connections import Places
 from gateway.parts.web.routes import Route, Word, drop
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
-from gateway.tags import Quality, Sample, Tag
+from gateway.tags import Sample, Tag
 
 MOST_PAGES = 20  # and of one client
 MOST_PAGES_OF_CLIENT = 16
@@ -209,9 +209,10 @@ class Page:
                 text = known if isinstance(known, str) else orjson.dumps(known).decode()
             if name := fields.get("text"):
                 text = f"{name} ({text})"
-            good = fields["quality"] == Quality.GOOD
-            told = (fields.get("origin"),) if good else (fields["reason"], fields.get("detail"))
-            why = " ".join(str(one) for one in told if one)
+            why: str = fields.get("origin") or ""
+            good = fields["quality"] != "bad"
+            if fields["quality"] == "bad":
+                why = " ".join(filter(None, (fields["reason"], fields.get("detail"))))
             found.append([tag.name, text if good else "", good, sample.time // 10**6, why])
         return found
 

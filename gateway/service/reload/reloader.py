@@ -11,6 +11,7 @@ import structlog
 from gateway import files as disk
 from gateway.config import Config, ConfigErrors, load
 from gateway.config.changes import Difference, needs_restart
+from gateway.contract.documents.state import ReloadDocument
 from gateway.errors import GatewayError
 from gateway.plant.threads import off_loop
 from gateway.tags.timestamps import rfc3339
@@ -91,7 +92,7 @@ class Reloader:
             return f"serving {len(self.current.devices)} devices"
         return f"the changed file was refused: {self._refused[1][0]}"
 
-    def document(self) -> Mapping[str, object]:
+    def document(self) -> ReloadDocument:
         """Returns the state of the file, for the status."""
         at, why = self._refused or (None, ())
         return {

@@ -1,0 +1,297 @@
+"""The state of the gateway, its lines, its devices and its parts: docs/status.md."""
+
+from typing import Annotated, Literal, NotRequired
+
+from typing_extensions import TypedDict
+
+from gateway.contract.documents.values import Number, Time, words
+from gateway.engine.device.identity import Verdict
+from gateway.engine.device.records import CallState
+from gateway.values import Value
+
+Standing = Annotated[str, words("starting", "up", "failing", "silent")]
+
+
+class StatusDocument(TypedDict):
+    """The gateway."""
+
+    contract: Number
+    name: str
+    version: str
+    time: Time
+    up: float
+    tags: int
+    simulated: list[str]
+    lines: dict[str, bool]
+    devices: dict[str, Standing]
+    refused_devices: dict[str, str]
+    refused_claims: list[str]
+
+
+class Measured(TypedDict):
+    load: float | None
+    requests_per_second: float | None
+    slowest_write: float
+
+
+class Expected(TypedDict):
+    load: float
+    requests_per_second: float
+    cycle: float
+    worst_write: float
+
+
+class CallsDocument(TypedDict):
+    """The telephone calls of a line."""
+
+    state: Annotated[CallState, words(*CallState)]
+    since: float | None
+    next: float | None
+    connected: bool
+    made: int
+    failed: int
+    in_a_row: int
+    last_result: str
+    last_failure: str
+    results: dict[str, int]
+
+
+class LineDocument(TypedDict):
+    """One line; with `served`: one that masters poll."""
+
+    open: bool
+    trouble: str
+    last_trouble: str
+    opened: int
+    open_for: float
+    down_for: NotRequired[float | None]
+    losses: NotRequired[int]
+    open_time: float
+    baudrate: int
+    devices: dict[str, Standing]
+    busy_time: float
+    measured: Measured
+    unasked_bytes: int
+    expected: Expected
+    calls: CallsDocument | None
+    served: NotRequired[bool]
+    stale_requests: NotRequired[int]
+    unsent_replies: NotRequired[int]
+
+
+class IdentityDocument(TypedDict):
+    verdict: Annotated[Verdict, words(*Verdict)]
+    wanted: dict[str, str]
+    told: dict[str, list[str]]
+
+
+class Lately(TypedDict):
+    requests: int
+    failed: dict[str, int]
+
+
+class BlockReads(TypedDict):
+    tags: str
+    every: float
+    measured_every: float | None
+    worst_age: float | None
+    reads: int
+    overruns: int
+
+
+class DeviceDocument(TypedDict):
+    """One device; with `served`: a station of this gateway that masters poll."""
+
+    protocol: str
+    station: int
+    standing: Standing
+    diagnosis: str
+    identity: IdentityDocument | None
+    silent_for: NotRequired[float | None]
+    silences: NotRequired[int]
+    lately: NotRequired[Lately]
+    exchanges: int
+    writes: int
+    slowest_write: float
+    wire_time: float
+    turnaround: float | None
+    silence: float
+    late_replies: int
+    unasked_frames: int
+    frames_heard: int
+    overruns: int
+    overdue: int
+    retries: int
+    last_good: float | None
+    failures: dict[str, int]
+    refusals: dict[str, int]
+    refused_addresses: list[str]
+    requests: list[BlockReads]
+    served: NotRequired[bool]
+    stale_after: NotRequired[float | None]
+
+
+class ZenohDocument(TypedDict):
+    """Messages, queries and connections."""
+
+    published: int
+    superseded: int
+    congested: int
+    dropped: int
+    queries: int
+    refused: int
+    puts_refused: int
+    refusals_untold: int
+    links: int
+    to: list[Literal["router", "peer", "client"]]
+    connect: list[str]
+
+
+class OutcomesDocument(TypedDict):
+    """Writes and commands by outcome, and their times."""
+
+    counts: dict[str, int]
+    sent: int
+    seconds: float
+    took: dict[str, int]
+
+
+class AlarmCounts(TypedDict):
+    """The number of alarms by state."""
+
+    normal: int
+    active: int
+    acknowledged: int
+    returned: int
+
+
+class PartDocument(TypedDict):
+    """Why a part stopped; `why` is empty while it works."""
+
+    why: str
+    again: int | None
+    failures: int
+
+
+class FileDocument(TypedDict):
+    """Why the last change of a file is not on disk; empty: it is."""
+
+    trouble: str
+
+
+class DamagedDocument(TypedDict):
+    """Damaged files that were moved aside."""
+
+    files: list[str]
+
+
+class CertificateDocument(TypedDict):
+    """The days that a certificate has left."""
+
+    file: str
+    expires: Time | None
+    days: float | None
+    trouble: str
+
+
+class ClockDocument(TypedDict):
+    """Jumps of the clock of the machine."""
+
+    jumps: int
+    last: float | None
+    ago: float | None
+
+
+class ReloadDocument(TypedDict):
+    """The configuration file."""
+
+    file: str
+    loaded: Time
+    reloads: int
+    refused: Time | None
+    why: list[str]
+
+
+class HistoryDocument(TypedDict):
+    """The history file. `state` is `ok` or one sentence."""
+
+    state: str
+    aside: list[str]
+    recorded: int
+    stored: int
+    waiting: int
+    lag: float
+    lost: int
+    writes_stored: int
+    writes_lost: int
+    refusals_stored: int
+    refusals_lost: int
+    alarms_stored: int
+    alarms_lost: int
+    bytes: int
+    oldest: Time | None
+
+
+class StandbyDocument(TypedDict):
+    """The gateway in its standby group."""
+
+    group: str
+    stand: Literal["waiting", "claiming", "active", "relieved"]
+    others_active: list[str]
+
+
+class ClaimDocument(TypedDict):
+    """The devices of a gateway; `signature` if the plant has a secret."""
+
+    contract: Number
+    ticket: int
+    group: str | None
+    devices: list[str]
+    signature: NotRequired[str]
+
+
+_Ends = TypedDict("_Ends", {"from": str, "to": str})
+
+
+class TransferDocument(_Ends):
+    """One row of the transfers."""
+
+    when: str
+    state: Literal["starting", "carried", "stale", "waiting", "refused", "unclear"]
+    code: Literal["0", "2", "4", "5", "6", "A", "B"] | None
+    meaning: str
+    why: str
+    value: Value | None
+    time: Time | None
+    last_carried: float | None
+    age: float | None
+    carried: int
+    not_done: int
+    refused: int
+    unclear: int
+
+
+class ServedKey(TypedDict):
+    key: str
+    verbs: list[str]
+
+
+class ServedDevice(TypedDict):
+    """`commands`: those that the file permits; `writable`: the number of tags with `write`."""
+
+    tags: int
+    writable: int
+    commands: list[str]
+    blocks: bool
+
+
+class IntrospectDocument(TypedDict):
+    """`signed`: writes, commands and acknowledgements need the signature of a writer."""
+
+    contract: Number
+    gateway: str
+    version: str
+    signed: bool
+    history: bool
+    documents: dict[str, ServedKey]
+    devices: dict[str, ServedDevice]
