@@ -78,7 +78,7 @@ async def test_only_the_state_directory_is_written_and_systemd_is_told(
             await asyncio.to_thread(gateway.says, "history ready")
             os.kill(gateway.pid, signal.SIGHUP)  # as `systemctl reload`
             await hears("READY=1")
-            assert gateway.has_said("file reloaded")
+            await asyncio.to_thread(gateway.says, "file reloaded")
             for _ in range(3):
                 await hears("WATCHDOG=1")
             copy = state / "copy.db"
