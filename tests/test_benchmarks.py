@@ -79,6 +79,11 @@ TINY = [
         "--rounds 1 --modes client --dead 0.5 --back 0.5",
         [r"^\| client \| 2 \| 1 \| [01] \| [01] \| [01] \|$"],
     ),
+    (
+        "device_servers",
+        "--count 3 --seconds 0.1",
+        [r"^3 device servers read", r"within [0-9.]+ s$"],
+    ),
     ("served", "--seconds 0.5", [r"^served-1: \d+ replies, \d+ lost: median", r"^a written value"]),
     ("sim_speed", "--minutes 0.05", [r"^every +30 s: +[\d.]+ simulated hours per minute"]),
     ("start", "--sizes 1 2 5", [r"^\| different \| run: 10 tags answer in [\d.]+ s \| [\d.]+"]),

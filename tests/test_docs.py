@@ -147,6 +147,7 @@ def test_every_page_with_files_is_checked() -> None:
             "serve.md",
             "shaping.md",
             "systems.md",
+            "device-servers.md",
         ),
         *("modem.md", "transfers.md"),
         *("templates.md", "trace.md", "alarms.md", "arrays.md"),

@@ -8,6 +8,7 @@ from typing import Any
 
 from gateway.config.line_rules import check_line, line_wire, modem_of
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
+from gateway.config.port_rules import check_device_servers, port_of
 from gateway.config.settings import parsers
 from gateway.config.settings.model import DeviceSection, LineSection
 from gateway.config.settings.records import Config, LineConfig
@@ -37,7 +38,7 @@ from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Tag
 from gateway.tags.tag import READ
-from gateway.transport.port import ModemAddress, SerialPath, SimulatorAddress
+from gateway.transport.port import ListenAddress, ModemAddress, SerialPath, SimulatorAddress
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
@@ -154,7 +155,7 @@ class Builder:
             devices = [until_the_next_call(one, raw) for one in devices]
         return LineConfig(
             name=name,
-            port=line.port,
+            port=port_of(line, path, self.mistakes),
             serial=serial,
             wire=wire,
             echo=line.echo,
@@ -280,8 +281,9 @@ class Builder:
 
     def _check_ports(self, lines: list[LineConfig], raw_lines: object) -> None:
         ports: dict[object, str] = {}
+        check_device_servers({line.name: line.port for line in lines}, self.mistakes)
         for line in lines:
-            if line.simulated:
+            if line.simulated or isinstance(line.port, ListenAddress):
                 continue
             port = line.port.port if isinstance(line.port, ModemAddress) else line.port
             known = realpath(port.path) if isinstance(port, SerialPath) else port

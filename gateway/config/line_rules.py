@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from gateway.config.messages import Mistakes, Path
+from gateway.config.port_rules import check_connection, direction
 from gateway.config.settings.model import LineSection
 from gateway.config.settings.modem_settings import ModemSection
 from gateway.engine.device.device_settings import DeviceSettings
@@ -13,17 +14,14 @@ from gateway.protocols.unsolicited import Unsolicited
 from gateway.stations.registry import can_simulate
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
+    ListenAddress,
     ModemAddress,
-    Rfc2217Address,
-    SerialPath,
     SerialSettings,
     SimulatorAddress,
     TcpAddress,
 )
-from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
 DIALS_IDLE, ANSWERS_IDLE = 5.0, 60.0  # seconds without an exchange until a call is ended
-LONGEST_CONNECT_DELAY = 10.0  # seconds
 _TEXT = 20  # characters, more than the modem's own text NO CARRIER with its line ends
 _LATE = 0.05  # seconds by which an adapter may delay a part of it
 
@@ -41,7 +39,7 @@ def check_line(
         mistakes.add((*path, "request_gap"), text)
     if line.listen_only:
         _check_listening(line, devices, path, mistakes)
-    _check_connection(line, devices, path, mistakes)
+    check_connection(line, devices, path, mistakes)
     for device in devices:
         driver, place = device.driver, (*path, "devices", device.name)
         if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):
@@ -123,30 +121,6 @@ def _check_unsolicited(devices: Sequence[DeviceSettings], path: Path, mistakes: 
         )
 
 
-def _check_connection(
-    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
-) -> None:
-    """A connection that comes and goes must suit the port, the devices and their intervals."""
-    delay, rounds, place = line.connect_delay, line.close_after, (*path, "close_after")
-    for setting in ("connect_delay", "close_after"):
-        if getattr(line, setting) and not isinstance(line.port, TcpAddress | Rfc2217Address):
-            text = "is a setting of a port tcp:// or rfc2217://: no other has a connection"
-            mistakes.add((*path, setting), f"{setting} {text}")
-    if delay > LONGEST_CONNECT_DELAY:
-        text = f"a delay is at most {LONGEST_CONNECT_DELAY:g}s: requests wait for it"
-        mistakes.add((*path, "connect_delay"), text)
-    if rounds and (line.serve or line.listen_only):
-        mistakes.add(place, "another master decides when this line speaks: remove close_after")
-    for device in devices if rounds else ():
-        if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited:
-            text = f"{device.name} sends unsolicited frames, which a closed connection loses"
-            mistakes.add(place, text)
-        short = min((tag.every for tag in device.wire_tags if tag.polled), default=2 * delay)
-        if short < 2 * delay:
-            text = f"{device.name} has an interval of {short:g} s, and each round waits {delay:g} s"
-            mistakes.add(place, f"{text} (connect_delay): write every: {2 * delay:g}s or more")
-
-
 def _check_listening(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> None:
@@ -189,10 +163,11 @@ def _check_network(
     mistakes: Mistakes,
 ) -> None:
     protocol = device.driver.protocol
-    if not isinstance(line.port, (TcpAddress, SimulatorAddress)):
+    if not isinstance(line.port, (TcpAddress, ListenAddress, SimulatorAddress)):
         mistakes.add(
             (*path, "protocol"),
-            f"{protocol} needs a port tcp://host:port: it does not run on a serial line",
+            f"{protocol} needs a port tcp://host:port or listen://host:port: it does not run on a "
+            "serial line",
         )
     serial = [other for other in devices if not other.driver.traits.over_network]
     if serial:
@@ -236,26 +211,11 @@ def modem_of(
     return ModemSettings(**own)
 
 
-def _direction(line: LineSection, path: Path, mistakes: Mistakes) -> Rs485 | None:
-    """Returns how RTS switches the transceiver; None: it is not switched."""
-    own = line.rs485
-    if own is None:
-        return None
-    if not isinstance(line.port, SerialPath):
-        text = "rs485 is a setting of a serial port of this computer: a device server has its own"
-        mistakes.add((*path, "rs485"), text)
-    for name, delay in (("before", own.before), ("after", own.after)):
-        if delay > LONGEST_DELAY or abs(delay * 1e3 - round(delay * 1e3)) > 1e-6:
-            text = "Linux waits whole milliseconds, at most 100ms: write 0ms, 1ms, 2ms"
-            mistakes.add((*path, "rs485", name), text)
-    return Rs485(own.rts == "send", own.before, own.after, hears_itself=bool(line.echo))
-
-
 def line_wire(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> tuple[SerialSettings, WireTiming]:
     """Returns speed and format: those of the file, or the defaults of all protocols of the line."""
-    rs485 = _direction(line, path, mistakes)
+    rs485 = direction(line, path, mistakes)
     traits = {device.driver.protocol: device.driver.traits for device in devices}
     rates = {name: usual.baudrate for name, usual in traits.items()}
     formats = {name: usual.format for name, usual in traits.items()}

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from gateway.errors import LineDown
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
+    ListenAddress,
     ModemAddress,
     Port,
     PortAddress,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _OPENERS = {
     SerialPath: "serial_port",
     TcpAddress: "tcp",
+    ListenAddress: "listen_port",
     Rfc2217Address: "rfc2217",
     ModemAddress: "modem",
 }
@@ -60,6 +62,10 @@ async def open_port(
             from gateway.transport.rfc2217 import open_rfc2217
 
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
+        case ListenAddress():
+            from gateway.transport.listen_port import open_listen
+
+            return await open_listen(where, receiver, timeout=timeout, baudrate=settings.baudrate)
         case ModemAddress():
             raise LineDown("a modem dials for a line of a file only")
         case SimulatorAddress():

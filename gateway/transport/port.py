@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from ipaddress import IPv4Network, IPv6Network, ip_address
 from typing import Protocol
 
 from gateway.errors import ConfigError
@@ -54,6 +55,37 @@ class Rfc2217Address:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceServer:
+    """Which device server a line waits for at its port `listen://…`, and what it sends by itself.
+
+    Without a registration every connection is taken. Without networks every address is allowed.
+    """
+
+    registration: bytes = b""
+    heartbeat: bytes = b""
+    networks: tuple[IPv4Network | IPv6Network, ...] = ()
+
+    @property
+    def words(self) -> tuple[bytes, ...]:
+        """What it sends by itself: no bytes of the line. Some send the registration each time."""
+        return tuple(word for word in (self.registration, self.heartbeat) if word)
+
+    def allows(self, address: str) -> bool:
+        found = ip_address(address.partition("%")[0])
+        found = getattr(found, "ipv4_mapped", None) or found
+        return not self.networks or any(found in one for one in self.networks)
+
+
+@dataclass(frozen=True, slots=True)
+class ListenAddress:
+    """A port of this machine that device servers connect to: `listen://host:port`."""
+
+    host: str
+    port: int
+    server: DeviceServer = DeviceServer()
+
+
+@dataclass(frozen=True, slots=True)
 class ModemAddress:
     """A modem at a serial port or device server: `modem:/dev/ttyS0`."""
 
@@ -65,7 +97,9 @@ class SimulatorAddress:
     """The built-in simulated PLCs, in memory."""
 
 
-PortAddress = SerialPath | TcpAddress | Rfc2217Address | ModemAddress | SimulatorAddress
+PortAddress = (
+    SerialPath | TcpAddress | Rfc2217Address | ListenAddress | ModemAddress | SimulatorAddress
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +111,9 @@ class SerialSettings:
     rs485: Rs485 | None = None  # None: the adapter switches by itself, or has wires for each way
 
 
+LONGEST_REGISTRATION = 256  # bytes
 MODEM = "modem:"
-_URL = re.compile(r"(tcp|rfc2217)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
+_URL = re.compile(r"(tcp|rfc2217|listen)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
@@ -88,17 +123,20 @@ def parse_port(text: str) -> PortAddress:
         return SimulatorAddress()
     if text.startswith(MODEM):
         below = parse_port(text.removeprefix(MODEM))
-        if isinstance(below, ModemAddress | SimulatorAddress):
+        if isinstance(below, ListenAddress | ModemAddress | SimulatorAddress):
             raise ConfigError(f"{text!r} is not a modem: write its port, such as modem:/dev/ttyS0")
         return ModemAddress(below)
     if match := _URL.match(text):
         scheme, host, port = match[1], match[2].strip("[]"), int(match[3])
         if not 1 <= port <= 65535:
             raise ConfigError(f"port number {port} is not 1..65535")
+        if scheme == "listen":
+            return ListenAddress(host, port)
         return TcpAddress(host, port) if scheme == "tcp" else Rfc2217Address(host, port)
     if _SCHEME.match(text) or not text.strip() or text != text.strip():
         raise ConfigError(
             f"{text!r} is not a port: write a path such as /dev/ttyUSB0 or COM3, "
-            "tcp://host:port, rfc2217://host:port, modem:/dev/ttyS0, or simulator"
+            "tcp://host:port, rfc2217://host:port, listen://host:port, modem:/dev/ttyS0, or "
+            "simulator"
         )
     return SerialPath(text)

@@ -334,8 +334,8 @@ LINES = [
             "parity: even\ndevices: {mixer: {protocol: vigor}}"
         ),
         "3: lines.hall.port: 'udp://10.0.0.7:4001' is not a port: write a path such as "
-        "/dev/ttyUSB0 or COM3, tcp://host:port, rfc2217://host:port, modem:/dev/ttyS0, or "
-        "simulator",
+        "/dev/ttyUSB0 or COM3, tcp://host:port, rfc2217://host:port, listen://host:port, "
+        "modem:/dev/ttyS0, or simulator",
         "4: lines.hall.baudrate: 1920 is no baud rate of serial ports; the nearest is 2400",
         "5: lines.hall.format: '7X1' is no character format: write data bits (7 or 8), parity "
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
@@ -432,8 +432,8 @@ LINES = [
     bad(
         "modbus-tcp on a wire",
         on_line("port: /dev/ttyS3\ndevices:\n  a: {protocol: modbus-tcp, station: 1}"),
-        "5: lines.hall.devices.a.protocol: modbus-tcp needs a port tcp://host:port: "
-        "it does not run on a serial line",
+        "5: lines.hall.devices.a.protocol: modbus-tcp needs a port tcp://host:port or "
+        "listen://host:port: it does not run on a serial line",
     ),
     bad(
         "modbus-tcp beside a serial protocol",

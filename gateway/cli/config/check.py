@@ -25,6 +25,7 @@ from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.capabilities import ChangesBits
 from gateway.tags.tag import CounterRule
+from gateway.transport.port import ListenAddress
 
 
 def check(
@@ -47,7 +48,7 @@ def check(
         return
     with progress(err) as report:
         loaded = load(config, report)
-        warnings = zenoh_warnings(loaded) + exposure.check(loaded)
+        warnings = zenoh_warnings(loaded) + exposure.check(loaded) + _open_to_all(loaded)
         lines = forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
@@ -86,6 +87,17 @@ def _without_polls(config: Config) -> Iterator[RenderableType]:
             f"{_counted(len(tags), 'tag')} can be learned, when another master reads them"
         )
         yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
+
+
+def _open_to_all(config: Config) -> list[str]:
+    """Returns a warning for each port that anybody can connect to as a device server."""
+    ports = {line.name: line.port for line in config.lines}
+    return [
+        f"line {name}: any computer that reaches {port.host}:{port.port} can answer for its "
+        "devices: write `device_server: {allow: [10.1.0.0/16]}` with your networks"
+        for name, port in ports.items()
+        if isinstance(port, ListenAddress) and not port.server.networks
+    ]
 
 
 def _notes(config: Config) -> Iterator[str]:

@@ -4,6 +4,7 @@ An editor shows the descriptions. Mistakes that need more than one setting (an a
 device does not have, two stations with one number) are found by `gateway.config.build`.
 """
 
+from ipaddress import IPv4Network, IPv6Network
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -14,6 +15,8 @@ from gateway.config.settings.session_model import GatewaySection, Section, Zenoh
 from gateway.config.settings.setting_types import (
     FORMAT_SCHEMA,
     IDENTITY_SCHEMA,
+    NETWORKS_SCHEMA,
+    SENT_BYTES_SCHEMA,
     Baudrate,
     Duration,
     FilePath,
@@ -78,11 +81,25 @@ class Rs485Section(Section):
     """From the last bit to switching back; whole milliseconds, at most 100ms."""
 
 
+class DeviceServerSection(Section):
+    """The device server that connects to a port `listen://host:port`: docs/device-servers.md."""
+
+    registration: Annotated[bytes | None, Parsed(parsers.sent_bytes, SENT_BYTES_SCHEMA)] = None
+    """The bytes that it sends first, such as DTU-0042; left out: every connection is taken."""
+    heartbeat: Annotated[bytes | None, Parsed(parsers.sent_bytes, SENT_BYTES_SCHEMA)] = None
+    """The bytes that it sends now and then, such as ping: they are no part of a reply."""
+    allow: Annotated[
+        tuple[IPv4Network | IPv6Network, ...] | None, Parsed(parsers.networks, NETWORKS_SCHEMA)
+    ] = None
+    """The addresses that may connect, such as [10.1.0.0/16]; left out: all."""
+
+
 class LineSection(Section):
     """One line and the devices on it."""
 
     port: Port
-    """A serial port, tcp://host:port, rfc2217://host:port, modem:<one of these>, or simulator."""
+    """A serial port, tcp://host:port, rfc2217://host:port, listen://host:port, modem:<port>, or
+    simulator."""
     baudrate: Baudrate = None
     """Speed of the line, also behind a device server; left out: the default of the protocol."""
     format: Annotated[str | None, Parsed(parsers.serial_format, FORMAT_SCHEMA)] = None
@@ -91,6 +108,8 @@ class LineSection(Section):
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
     rs485: Rs485Section | None = None
     """Has Linux switch the RS-485 transceiver of a serial port; left out: it switches by itself."""
+    device_server: DeviceServerSection | None = None
+    """Of a port `listen://…`: which device server this line waits for."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
     request_gap: Duration | None = None

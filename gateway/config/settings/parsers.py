@@ -8,13 +8,21 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable
+from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import Literal
 
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
 from gateway.files import is_name
-from gateway.transport.port import MODEM, PortAddress, SerialPath, parse_port
+from gateway.protocols.frames.bytetext import octets
+from gateway.transport.port import (
+    LONGEST_REGISTRATION,
+    MODEM,
+    PortAddress,
+    SerialPath,
+    parse_port,
+)
 from gateway.values import ValueType, parse_type
 
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
@@ -209,6 +217,29 @@ def port(text: object) -> PortAddress:
             raise ConfigError(f"{text} is a port of Windows: here it is a path like /dev/ttyUSB0")
         raise ConfigError(f"{text} is no port: did you mean /dev/{text}?")
     return found
+
+
+def sent_bytes(text: object) -> bytes:
+    """Parses what a device server sends by itself, such as `DTU-0042<CR>`."""
+    found = octets(_text(text))
+    if not 1 <= len(found) <= LONGEST_REGISTRATION:
+        raise ConfigError(f"{shown(text)} has {len(found)} bytes: write 1..{LONGEST_REGISTRATION}")
+    return found
+
+
+def networks(value: object) -> tuple[IPv4Network | IPv6Network, ...]:
+    """Parses a list of addresses and networks, such as `[10.1.0.0/16, 192.0.2.7]`."""
+    found = list[IPv4Network | IPv6Network]()
+    for text in value if isinstance(value, list) else [value]:
+        try:
+            found.append(ip_network(text if isinstance(text, str) else ""))
+        except ValueError:
+            raise ConfigError(
+                f"{shown(text)} is no network: write [10.1.0.0/16, 192.0.2.7]"
+            ) from None
+    if not found:
+        raise ConfigError("no network: write [10.1.0.0/16, 192.0.2.7], or remove `allow`")
+    return tuple(found)
 
 
 def baudrate(value: object) -> int:

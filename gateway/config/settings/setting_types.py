@@ -70,6 +70,14 @@ TYPE_SCHEMA = {
         {"type": "string", "pattern": rf"^({_ARRAYS})\[0*([1-9][0-9]{{0,2}}|1[0-9]{{3}}|2000)\]$"},
     ]
 }
+SENT_BYTES_SCHEMA = {"type": "string", "minLength": 1, "examples": ["DTU-0042", "ping<CR><LF>"]}
+NETWORKS_SCHEMA = {
+    "anyOf": [
+        {"type": "string"},
+        {"type": "array", "items": {"type": "string"}, "minItems": 1},
+    ],
+    "examples": [["10.1.0.0/16", "192.0.2.7"]],
+}
 IDENTITY_SCHEMA = {"type": "object", "additionalProperties": {"type": "string"}, "minProperties": 1}
 SCALE_SCHEMA = {"type": "number", "not": {"const": 0}}
 _ENDPOINT_SCHEMA = {
@@ -81,13 +89,14 @@ _HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+)"
 _PORT_SCHEMA = {
     "type": "string",
     # A network port, or a path: no other scheme, and no `host:port` without a scheme.
-    "pattern": rf"^((tcp|rfc2217)://{_HOST}:[0-9]{{1,5}}"
+    "pattern": rf"^((tcp|rfc2217|listen)://{_HOST}:[0-9]{{1,5}}"
     r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
     "examples": [
         "/dev/ttyUSB0",
         "COM3",
         "tcp://10.0.0.7:4001",
         "rfc2217://host:port",
+        "listen://0.0.0.0:5020",
         "modem:/dev/ttyS0",
         "simulator",
     ],

@@ -1,0 +1,127 @@
+"""Device servers that connect to one port: what 500 of them cost, and how soon they are back.
+
+    python -m benchmarks.device_servers [--count 500] [--seconds 30]
+
+The gateway is a process of its own. Each device server of this process registers, sends heartbeats
+and answers one Modbus RTU read a second. Then all connections are reset at once, and each connects
+again within a second. It prints processor time and memory of the gateway, and the seconds until
+every device was read again.
+"""
+
+import argparse
+import asyncio
+import os
+import random
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from gateway.protocols.checksums import crc16
+from tests.e2e.processes import Program, free_port, started, write_config
+from tests.zenoh_peer import free_endpoint
+
+HEARTBEAT = 10.0  # seconds
+READ = 8  # bytes of a request
+REPLY = bytes([1, 3, 2, 0, 7])
+REPLY += crc16(REPLY)
+
+
+class DeviceServer:
+    """One of them, with a slave behind it."""
+
+    def __init__(self, number: int, port: int) -> None:
+        self._registration = f"DTU-{number:04}".encode()
+        self._port = port
+        self._writer: asyncio.StreamWriter | None = None
+        self.answered = asyncio.Event()
+
+    async def run(self) -> None:
+        while True:
+            with suppress(OSError, asyncio.IncompleteReadError):
+                await self._connect()
+            await asyncio.sleep(random.random())
+
+    async def _connect(self) -> None:
+        reader, self._writer = await asyncio.open_connection("127.0.0.1", self._port)
+        self._writer.write(self._registration)
+        beats = asyncio.create_task(self._beat(self._writer))
+        try:
+            while True:
+                await reader.readexactly(READ)
+                self._writer.write(REPLY)
+                self.answered.set()
+        finally:
+            beats.cancel()
+            self._writer.transport.abort()
+
+    @staticmethod
+    async def _beat(writer: asyncio.StreamWriter) -> None:
+        while True:
+            await asyncio.sleep(HEARTBEAT)
+            writer.write(b"ping")
+
+    def reset(self) -> None:
+        self.answered.clear()
+        if self._writer is not None:
+            self._writer.transport.abort()
+
+
+def plant(folder: Path, port: int, count: int) -> Path:
+    def line(number: int) -> dict[str, Any]:
+        tags = {"level": {"address": "holding:7", "every": "1s"}}
+        device = {"protocol": "modbus-rtu", "station": 1, "tags": tags}
+        return {
+            "port": f"listen://127.0.0.1:{port}",
+            "device_server": {"registration": f"DTU-{number:04}", "heartbeat": "ping"},
+            "devices": {f"pump-{number}": device},
+        }
+
+    lines = {f"site-{number}": line(number) for number in range(count)}
+    return write_config(folder / "plant.yaml", free_endpoint(), lines)
+
+
+def used(gateway: Program) -> tuple[float, float]:
+    """Returns the seconds of processor time and the MB of memory of the gateway."""
+    stat = Path(f"/proc/{gateway.pid}/stat").read_text().rpartition(")")[2].split()
+    pages = int(Path(f"/proc/{gateway.pid}/statm").read_text().split()[1])
+    seconds = (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
+    return seconds, pages * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+async def measured(gateway: Program, port: int, count: int, seconds: float) -> None:
+    servers = [DeviceServer(number, port) for number in range(count)]
+    tasks = [asyncio.create_task(one.run()) for one in servers]
+    begun = time.monotonic()
+    await asyncio.gather(*(one.answered.wait() for one in servers))
+    print(f"{count} device servers read {time.monotonic() - begun:.1f} s after they began")
+    before, began = used(gateway)[0], time.monotonic()
+    await asyncio.sleep(seconds)
+    after, memory = used(gateway)
+    core = (after - before) / (time.monotonic() - began)
+    print(f"one read a second of each: {core:.2f} of a core, {memory:.0f} MB")
+    begun = time.monotonic()
+    for one in servers:
+        one.reset()
+    await asyncio.gather(*(one.answered.wait() for one in servers))
+    print(f"all connections reset: every device read again within {time.monotonic() - begun:.1f} s")
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=500)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        port = free_port()
+        with started(plant(Path(folder), port, asked.count)) as gateway:
+            asyncio.run(measured(gateway, port, asked.count, asked.seconds))
+            gateway.lines.clear()  # it prints them at the end
+
+
+if __name__ == "__main__":
+    main()

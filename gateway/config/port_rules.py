@@ -1,0 +1,94 @@
+"""Checks the port of a line: RS-485, connections that come and go, device servers that connect."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from gateway.config.messages import Mistakes, Path
+from gateway.config.settings.model import LineSection
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.protocols.unsolicited import Unsolicited
+from gateway.transport.port import (
+    DeviceServer,
+    ListenAddress,
+    PortAddress,
+    Rfc2217Address,
+    SerialPath,
+    TcpAddress,
+)
+from gateway.transport.rs485 import LONGEST_DELAY, Rs485
+
+LONGEST_CONNECT_DELAY = 10.0  # seconds
+
+
+def port_of(line: LineSection, path: Path, mistakes: Mistakes) -> PortAddress:
+    """Returns the port, with the device server that it waits for."""
+    port, own = line.port, line.device_server
+    if not isinstance(port, ListenAddress):
+        if own is not None:
+            text = "the line waits for no device server: its port is not listen://host:port"
+            mistakes.add((*path, "device_server"), text)
+        return port
+    if line.serve:
+        text = "a line with `serve: true` is the one that listens: write the port as tcp://"
+        mistakes.add((*path, "port"), text)
+    if own is None:
+        return port
+    return replace(
+        port, server=DeviceServer(own.registration or b"", own.heartbeat or b"", own.allow or ())
+    )
+
+
+def check_device_servers(lines: Mapping[str, PortAddress], mistakes: Mistakes) -> None:
+    """Refuses two lines that one device server could mean. `lines`: their ports by name."""
+    met: dict[tuple[str, int], dict[str, bytes]] = {}
+    for name, port in lines.items():
+        if not isinstance(port, ListenAddress):
+            continue
+        others = met.setdefault((port.host, port.port), {})
+        mine, place = port.server.registration, ("lines", name, "device_server")
+        for other, its in others.items():
+            if mine.startswith(its) or its.startswith(mine):
+                text = f"line {other} has this port too: give both a `registration`, such as "
+                text += "{registration: DTU-0042}, that does not begin with the other one"
+                mistakes.add(place, text)
+                break
+        others[name] = mine
+
+
+def check_connection(
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """A connection that comes and goes must suit the port, the devices and their intervals."""
+    delay, rounds, place = line.connect_delay, line.close_after, (*path, "close_after")
+    for setting in ("connect_delay", "close_after"):
+        if getattr(line, setting) and not isinstance(line.port, TcpAddress | Rfc2217Address):
+            text = "is a setting of a port tcp:// or rfc2217://: no other has a connection"
+            mistakes.add((*path, setting), f"{setting} {text}")
+    if delay > LONGEST_CONNECT_DELAY:
+        text = f"a delay is at most {LONGEST_CONNECT_DELAY:g}s: requests wait for it"
+        mistakes.add((*path, "connect_delay"), text)
+    if rounds and (line.serve or line.listen_only):
+        mistakes.add(place, "another master decides when this line speaks: remove close_after")
+    for device in devices if rounds else ():
+        if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited:
+            text = f"{device.name} sends unsolicited frames, which a closed connection loses"
+            mistakes.add(place, text)
+        short = min((tag.every for tag in device.wire_tags if tag.polled), default=2 * delay)
+        if short < 2 * delay:
+            text = f"{device.name} has an interval of {short:g} s, and each round waits {delay:g} s"
+            mistakes.add(place, f"{text} (connect_delay): write every: {2 * delay:g}s or more")
+
+
+def direction(line: LineSection, path: Path, mistakes: Mistakes) -> Rs485 | None:
+    """Returns how RTS switches the transceiver; None: it is not switched."""
+    own = line.rs485
+    if own is None:
+        return None
+    if not isinstance(line.port, SerialPath):
+        text = "rs485 is a setting of a serial port of this computer: a device server has its own"
+        mistakes.add((*path, "rs485"), text)
+    for name, delay in (("before", own.before), ("after", own.after)):
+        if delay > LONGEST_DELAY or abs(delay * 1e3 - round(delay * 1e3)) > 1e-6:
+            text = "Linux waits whole milliseconds, at most 100ms: write 0ms, 1ms, 2ms"
+            mistakes.add((*path, "rs485", name), text)
+    return Rs485(own.rts == "send", own.before, own.after, hears_itself=bool(line.echo))

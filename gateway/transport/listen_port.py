@@ -1,0 +1,278 @@
+"""Ports that device servers connect to: `listen://host:port`, one for each registration.
+
+A device server behind a mobile network has no address that anybody could connect to. So it connects
+itself, and says who it is by its first bytes, the registration. It may send heartbeats at any time;
+they are no bytes of the line.
+"""
+
+import asyncio
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
+
+import structlog
+
+from gateway.errors import LineDown
+from gateway.transport.os_errors import line_down
+from gateway.transport.port import LONGEST_REGISTRATION, DeviceServer, ListenAddress, Receiver
+from gateway.transport.stream import Allowance, StreamPort
+from gateway.transport.tcp import configure
+
+log = structlog.get_logger("gateway.line")
+
+REGISTERS_WITHIN = 10.0  # seconds
+MOST_UNREGISTERED = 64  # connections; for one more the oldest of the busiest address is closed
+SILENT = 5.0  # seconds after which a second connection of a registration replaces the first
+UNUSED = 30.0  # seconds without a line until a door closes: a line that reopens needs it again
+_LOG_EVERY = 10.0  # seconds
+_SHOWN = 32  # bytes of a refused registration in the log
+
+
+class _Nobody:
+    """Receives what arrives while no line uses the connection."""
+
+    def received(self, data: bytes) -> None:
+        pass
+
+    def lost(self, error: Exception) -> None:
+        pass
+
+
+class _Connection(StreamPort):
+    """The connection of one device server; once it is registered, the port of a line."""
+
+    def __init__(self, door: "_Door") -> None:
+        super().__init__(door.name, _Nobody())
+        self._door = door
+        self.address = ""
+        self.greeting = b""  # the first bytes
+        self.server: DeviceServer | None = None
+        self.heard_at = asyncio.get_running_loop().time()
+        self.ready()
+
+    @property
+    def is_open(self) -> bool:
+        return self._is_open
+
+    @property
+    def has_line(self) -> bool:
+        return not isinstance(self._receiver, _Nobody)
+
+    def serve(self, receiver: Receiver, baudrate: int) -> None:
+        """Passes what arrives from now on to a line. Raises `LineDown` if it was lost."""
+        if self._loss is not None:
+            raise self._line_down()
+        self._receiver, self._allowance = receiver, Allowance(baudrate)
+
+    def end(self, why: str) -> None:
+        """Closes the connection, and tells its line why."""
+        self._break(why)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        try:
+            configure(transport.get_extra_info("socket"))
+            self.address = str(transport.get_extra_info("peername")[0])
+        except (OSError, TypeError):  # it is gone already: it has no address
+            self.end("gone")
+            return
+        self._door.connected(self)
+
+    def data_received(self, data: bytes) -> None:
+        self.heard_at = asyncio.get_running_loop().time()
+        if self.server is None:
+            self.greeting = (self.greeting + data)[:LONGEST_REGISTRATION]
+            self._door.greeted(self)
+            return
+        while word := next((one for one in self.server.words if data.startswith(one)), b""):
+            data = data[len(word) :]
+        if data:
+            super().data_received(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._door.lost(self)
+        super().connection_lost(exc)
+
+
+@dataclass(eq=False)
+class _Door:
+    """One port of this machine, and the device servers that are connected to it."""
+
+    where: tuple[str, int]
+    _server: asyncio.Server | None = None
+    _opening: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _unregistered: dict[_Connection, asyncio.TimerHandle] = field(default_factory=dict)
+    _known: dict[DeviceServer, asyncio.Event] = field(default_factory=dict)  # set: it is connected
+    _connected: dict[DeviceServer, _Connection] = field(default_factory=dict)
+    _second: dict[DeviceServer, _Connection] = field(default_factory=dict)
+    _seen: set[DeviceServer] = field(default_factory=set)
+    _refused: int = 0  # since the last line of the log
+    _logged_at: float = -_LOG_EVERY
+    _end: asyncio.TimerHandle | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.where[0]}:{self.where[1]}"
+
+    async def connection(self, server: DeviceServer, timeout: float) -> _Connection:
+        """Returns its connection, or waits for it. Raises `LineDown`."""
+        arrived = self._known.setdefault(server, asyncio.Event())
+        async with self._opening:
+            if self._server is None:
+                await self._open()
+        self.keep()
+        for one in list(self._unregistered):
+            self.greeted(one)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await arrived.wait()
+        if server in self._connected:
+            return self._connected[server]
+        again = " again" if server in self._seen else ""
+        who = f" as {_shown(server.registration)}" if server.registration else ""
+        raise LineDown(f"{self.name}: no device server has connected{again}{who}")
+
+    async def _open(self) -> None:
+        create = asyncio.get_running_loop().create_server
+        try:
+            self._server = await create(lambda: _Connection(self), *self.where)
+        except (OSError, UnicodeError, OverflowError) as error:
+            raise line_down(self.name, error) from error
+
+    def keep(self) -> None:
+        """Stays open for `UNUSED` seconds, and while a line has a connection."""
+        if self._end is not None:
+            self._end.cancel()
+        self._end = asyncio.get_running_loop().call_later(UNUSED, self._end_unused)
+
+    def _end_unused(self) -> None:
+        if any(one.has_line for one in self._connected.values()):
+            self.keep()
+        else:
+            self.close()
+
+    def close(self) -> None:
+        """Closes the port and its connections. A line that needs it opens it again."""
+        if self._end is not None:
+            self._end.cancel()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        for one in [*self._unregistered, *self._connected.values(), *self._second.values()]:
+            one.end("the port was closed")
+
+    # Called by the connections
+
+    def connected(self, one: _Connection) -> None:
+        if len(self._unregistered) >= MOST_UNREGISTERED:
+            [(most, _)] = Counter(other.address for other in self._unregistered).most_common(1)
+            self._refuse(next(other for other in self._unregistered if other.address == most))
+        late = asyncio.get_running_loop().call_later(REGISTERS_WITHIN, self._refuse, one)
+        self._unregistered[one] = late
+        self.greeted(one)
+
+    def greeted(self, one: _Connection) -> None:
+        """Registers a connection as soon as its first bytes say who it is.
+
+        What follows the registration is older than any request.
+        """
+        found = [
+            server
+            for server in self._known
+            if one.greeting.startswith(server.registration) and server.allows(one.address)
+        ]
+        if found:
+            self._unregistered.pop(one).cancel()
+            one.server = max(found, key=lambda server: len(server.registration))
+            self._registered(one, one.server)
+
+    def lost(self, one: _Connection) -> None:
+        if (late := self._unregistered.pop(one, None)) is not None:
+            late.cancel()
+        if one.server is not None and self._connected.get(one.server) is one:
+            del self._connected[one.server]
+            self._known[one.server].clear()
+            self.keep()
+            if (second := self._second.pop(one.server, None)) is not None and second.is_open:
+                self._take(second, one.server)
+
+    def _registered(self, one: _Connection, server: DeviceServer) -> None:
+        """A device server that lost its power connects again before the system knows that its first
+        connection is gone. If the first one still sends, the second is another device server."""
+        first = self._connected.get(server)
+        if first is None:
+            self._take(one, server)
+            return
+        if (other := self._second.pop(server, None)) is not None:
+            other.end("its device server has connected again")
+        self._second[server] = one
+        loop = asyncio.get_running_loop()
+        loop.call_at(first.heard_at + SILENT, self._decide, one, first, first.heard_at)
+
+    def _decide(self, one: _Connection, first: _Connection, heard_at: float) -> None:
+        if one.server is None or self._second.get(one.server) is not one:
+            return
+        if first.heard_at > heard_at:
+            del self._second[one.server]
+            self._refuse(one)
+        else:
+            first.end("its device server has connected again")
+
+    def _take(self, one: _Connection, server: DeviceServer) -> None:
+        self._connected[server] = one
+        self._seen.add(server)
+        self._known[server].set()
+        who = {"address": one.address, "registration": _shown(server.registration)}
+        log.info("device server connected", port=self.name, **who)
+
+    def _refuse(self, one: _Connection) -> None:
+        if (late := self._unregistered.pop(one, None)) is not None:
+            late.cancel()
+        if one.server is not None:
+            why, sent = "another one with its registration still sends", one.server.registration
+        elif any(server.allows(one.address) for server in self._known):
+            why, sent = "no line has its registration", one.greeting
+        else:
+            why, sent = "no line allows its address", one.greeting
+        one.end(why)
+        self._refused += 1
+        now = asyncio.get_running_loop().time()
+        if now - self._logged_at >= _LOG_EVERY:
+            who = {"address": one.address, "sent": _shown(sent[:_SHOWN])}
+            log.warning("connection refused", port=self.name, **who, why=why, refused=self._refused)
+            self._refused, self._logged_at = 0, now
+
+
+_doors: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[tuple[str, int], _Door]] = (
+    WeakKeyDictionary()
+)
+
+
+async def open_listen(
+    where: ListenAddress, receiver: Receiver, *, timeout: float = 5.0, baudrate: int = 0
+) -> StreamPort:
+    """Returns the connection of a device server, or waits for it. Raises `LineDown`.
+
+    `baudrate`: of the wire behind it; 0: not known.
+    """
+    doors = _doors.setdefault(asyncio.get_running_loop(), {})
+    place = (where.host, where.port)
+    door = doors.setdefault(place, _Door(place))
+    port = await door.connection(where.server, timeout)
+    port.serve(receiver, baudrate)
+    return port
+
+
+def close_doors() -> None:
+    """Closes every port that device servers connect to, in this event loop."""
+    for door in _doors.pop(asyncio.get_running_loop(), {}).values():
+        door.close()
+
+
+def _shown(data: bytes) -> str:
+    """Returns bytes as the file writes them: `DTU-0042<CR>`."""
+    return "".join(chr(one) if one in _PLAIN else f"<{one:02X}>" for one in data)
+
+
+_PLAIN = {*range(0x20, 0x7F)} - {*b"<>{}\\"}
