@@ -25,6 +25,7 @@ from gateway.plant.threads import off_loop
 from gateway.service.bulkheads import Bulkheads
 from gateway.service.reload import LiveReload, Reloader, RunningLines
 from gateway.service.supervisor import Supervisor
+from gateway.transport.listen_port import close_doors
 
 log = structlog.get_logger("gateway")
 # Seconds. Python's usual 5 ms of the publishing thread would delay the lines.
@@ -164,6 +165,7 @@ async def _serve(
                 await parts.start(Phase.ACTIVE, Phase.DRIVING)
                 for line, plan in zip(plant.lines, plans, strict=True):
                     running.start(line, line.engine.name, _run_planned(line, plan))
+                cleanup.callback(close_doors)  # a standby accepts no device server
                 cleanup.push_async_callback(running.end_all)  # before Zenoh: the last outcomes
                 cleanup.push_async_callback(parts.stop, Phase.DRIVING)
                 cleanup.push_async_callback(_end, [reload])  # before the lines: it starts some
