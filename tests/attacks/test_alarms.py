@@ -1,7 +1,9 @@
 """Alarms of a real gateway: a silent PLC and a restart neither clear nor forget one."""
 
+import asyncio
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tests.e2e.processes import (
@@ -9,12 +11,27 @@ from tests.e2e.processes import (
     plc_gateway,
     started,
     station,
+    until,
     vigor_line,
     write_config,
 )
 from tests.zenoh_peer import Received, ZenohPeer, free_endpoint
 
 SPEED = "plant/@gateway/demo/alarms/mixer/speed"
+
+
+@contextmanager
+def no_room(path: Path) -> Iterator[None]:
+    """A file cannot be saved, as on a full disk: a folder has the name of its next content."""
+
+    def made() -> bool:
+        with suppress(FileExistsError):  # it is being saved
+            path.mkdir()
+        return path.is_dir()
+
+    until(made, "the folder is there")
+    yield
+    path.rmdir()
 
 
 def seen(state: str, quality: str) -> Callable[[Received], bool]:
@@ -72,7 +89,10 @@ async def test_an_alarm_survives_bad_values_and_a_restart(tmp_path: Path) -> Non
 
 
 async def test_an_acknowledgement_survives_a_kill(tmp_path: Path) -> None:
-    """Eight alarms: each is acknowledged, answered, and still acknowledged after `kill -9`."""
+    """Eight alarms: each is acknowledged, answered, and still acknowledged after `kill -9`.
+
+    One that the disk does not take is refused, and said.
+    """
     endpoint = free_endpoint()
     tags = {f"t{n}": {"address": f"D{n}", "alarm": {"low": 30_000}} for n in range(8)}
     lines = {"hall": vigor_line("simulator", tags)}
@@ -86,6 +106,11 @@ async def test_an_acknowledgement_survives_a_kill(tmp_path: Path) -> None:
             for n in range(8):
                 if f"mixer/t{n}" not in active:
                     await changes.next(_is_active(f"mixer/t{n}"))
+            with no_room(tmp_path / "alarms.json.new"):
+                [refused] = await client.get(keys[0], b'{"by": "Ana"}')
+                assert refused.json["error"] == "busy"
+                done = await asyncio.to_thread(plc_gateway, "status", file)
+                assert (done.code, "alarms.json" in done.out) == (1, True)
             answers = await client.many([(key, b'{"by": "Ana"}') for key in keys])
             first.end(signal.SIGKILL)
         assert [one.json["state"] for [one] in answers] == ["acknowledged"] * 8
