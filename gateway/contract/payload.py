@@ -211,9 +211,9 @@ def word(result: WriteResult | CommandResult | Failure) -> OutcomeWord:
             return problem
 
 
-def document(fields: Mapping[str, object]) -> bytes:
+def document(found: object) -> bytes:
     """A status document; values of types that JSON lacks are written as text."""
-    return orjson.dumps(fields, default=str, option=orjson.OPT_NON_STR_KEYS)
+    return orjson.dumps(found, default=str, option=orjson.OPT_NON_STR_KEYS)
 
 
 def sample_fields(sample: Sample) -> ValueDocument:

@@ -269,4 +269,4 @@ def _changes(known: Mapping[str, object], now: Mapping[str, object]) -> dict[str
 
 
 def _event(kind: str, data: object) -> bytes:
-    return b"event: %b\ndata: %b\n\n" % (kind.encode(), orjson.dumps(data, default=str))
+    return b"event: %b\ndata: %b\n\n" % (kind.encode(), payload.document(data))

@@ -7,9 +7,9 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 
-import orjson
 from aiohttp import web
 
+from gateway.contract import payload
 from gateway.parts.web.connections import Place
 from gateway.parts.web.schemas import TEXT, Schema
 from gateway.plant.threads import off_loop
@@ -164,13 +164,13 @@ def answer(status: int, error: str) -> web.Response:
 
 async def json_off_loop(make: Callable[[], object]) -> web.Response:
     def body() -> bytes:
-        return orjson.dumps(make(), default=str, option=orjson.OPT_NON_STR_KEYS)
+        return payload.document(make())
 
     return raw(await off_loop(body))
 
 
 def as_json(found: object) -> web.Response:
-    return raw(orjson.dumps(found, default=str, option=orjson.OPT_NON_STR_KEYS))
+    return raw(payload.document(found))
 
 
 def raw(body: bytes, status: int = 200) -> web.Response:
