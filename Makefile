@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pins crowd parsers clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -43,6 +43,11 @@ bench: .venv/ready
 # Reloads under load: memory, missed polls, what is left over.
 reloads: .venv/ready
 	$(BIN)/python -m benchmarks.reload
+
+# Each view of the page, on a phone, a laptop and a wall display, in light and dark, with and without
+# faults: in build/pictures.
+pictures: .venv/ready
+	$(BIN)/python -m benchmarks.pictures
 
 # This gateway beside its peers (docs/peers.md); .ci/install-peers installs them.
 peers: .venv/ready

@@ -27,8 +27,9 @@ from gateway.config import Config, load
 from gateway.contract import payload
 from gateway.contract.faults import Documents
 from gateway.northbound.requests.audit import Counts
-from gateway.parts.web.api import Api
+from gateway.parts.web.connections import Who
 from gateway.parts.web.events import WIRE_EVERY, Events, Loads, Page
+from gateway.parts.web.tag_list import TagList
 from gateway.plant.part import Core
 from gateway.plant.plant import Plant
 from tests.e2e.processes import free_port
@@ -94,15 +95,15 @@ def core_of(gateway: Plant, north: Any) -> Core:
 
 async def show(core: Core, made: list[float]) -> None:
     """Makes the events of one page. Adds the processor time of each to `made`."""
-    api, loads = Api(core), Loads(core)
-    events = Events(core, api, loads, lambda _: True)
+    tags, loads, client = TagList(core.plant, ()), Loads(core), Who("", may_write=False)
+    events = Events(core, tags, loads, lambda _: client)
     measuring = asyncio.create_task(loads.run())
     try:
         with events.wires.watched("line0") as recorder:
-            page = Page(core, events, api.select("d0-0", "", None, 200), recorder)
+            page = Page(core, events, tags.chosen("d0-0/*"), recorder)
             while True:
                 begun = time.process_time()  # nothing else runs meanwhile
-                await page.next()
+                await page.next(client)
                 made.append(time.process_time() - begun)
                 await asyncio.sleep(WIRE_EVERY)
     finally:
@@ -161,17 +162,19 @@ def until_up(port: int, devices: int) -> None:
         time.sleep(1)
 
 
-async def first_paint(port: int, chromium: str, profile: Path) -> tuple[float, float]:
-    """Seconds until something is painted, and until every value of a device is shown."""
+async def first_paint(port: int, chromium: str, profile: Path) -> tuple[float, float, float]:
+    """Returns seconds until something is painted and until the values are shown, and the bytes that
+    were loaded until then."""
     async with browser(chromium, profile) as tab:
-        begun = time.monotonic()
-        await tab.open(f"http://127.0.0.1:{port}/#line=line0&device=d0-0")
-        await tab.until(
-            'document.body?.className === "" && document.querySelectorAll("#values tr").length > 90'
-        )
-        live = time.monotonic() - begun
+        await tab.open(f"http://127.0.0.1:{port}/#overview")
+        await tab.until("performance.getEntriesByName('values').length > 0")
         paint = await tab.value('performance.getEntriesByName("first-paint")[0].startTime')
-        return paint / 1000, live
+        live = await tab.value('performance.getEntriesByName("values")[0].startTime')
+        size = await tab.value(
+            'performance.getEntries().filter((one) => !one.name.includes("/api/"))'
+            ".reduce((all, one) => all + (one.transferSize ?? 0), 0)"
+        )
+        return paint / 1000, live / 1000, size
 
 
 def measure(process: subprocess.Popen[bytes], port: int, folder: Path, devices: int) -> None:
@@ -183,8 +186,8 @@ def measure(process: subprocess.Popen[bytes], port: int, folder: Path, devices: 
         f"one scrape: {size / 1e6:.1f} MB in {taken:.2f} s, {processor(process) - used:.2f} s CPU"
     )
     if chromium := shutil.which("chromium"):
-        paint, live = asyncio.run(first_paint(port, chromium, folder / "profile"))
-        print(f"first paint after {paint:.2f} s, all values live after {live:.2f} s")
+        paint, live, loaded = asyncio.run(first_paint(port, chromium, folder / "profile"))
+        print(f"first paint after {paint:.2f} s, values after {live:.2f} s, {loaded / 1000:.0f} kB")
 
 
 def main() -> None:

@@ -59,10 +59,21 @@ def test_the_package_is_typed() -> None:
 
 def test_the_license_is_the_one_that_the_project_names() -> None:
     assert PROJECT["project"]["license"] == "Apache-2.0"
-    assert PROJECT["project"]["license-files"] == ["LICENSE"]
+    [own, uplot] = PROJECT["project"]["license-files"]
+    assert own == "LICENSE"
+    assert (ROOT / uplot).read_text("utf-8").startswith("The MIT License (MIT)")
     text = (ROOT / "LICENSE").read_text("utf-8")
     assert text.split()[:4] == ["Apache", "License", "Version", "2.0,"]
     assert "END OF TERMS AND CONDITIONS" in text
+
+
+def test_the_library_of_the_page_is_the_one_that_its_page_names() -> None:
+    """The file is that of npm, as it is."""
+    assets = ROOT / "gateway/parts/web/assets"
+    text = (assets / "uplot.js").read_text("utf-8")
+    [version] = re.findall(r"^/\*! \S+uPlot \(v([\d.]+)\) \*/", text)
+    assert f"uPlot {version}" in (ROOT / "docs/page.md").read_text("utf-8")
+    assert "MIT" in (assets / "uplot-license.txt").read_text("utf-8")
 
 
 def test_the_container_is_built_with_every_file_that_the_build_needs() -> None:

@@ -96,6 +96,15 @@ def warnings(documents: Documents) -> Iterator[str]:
         yield f"history: {lost} samples were lost since the start"
 
 
+def causes(line: str, documents: Documents) -> tuple[list[str], list[str]]:
+    """Returns faults and warnings of one line: a sentence for each cause."""
+    document = documents[f"lines/{line}"]
+    devices, unreachable = _devices_of(document, documents), _unreachable(documents)
+    wrong = () if stands_by(documents) else line_fault(line, document, devices)
+    told = device_warnings(line, [one for one in devices if one[0] not in unreachable])
+    return [*wrong], [*told]
+
+
 def _devices_of(line: Document, documents: Documents) -> list[tuple[str, Document]]:
     found = [(name, documents.get(f"devices/{name}")) for name in line["devices"]]
     return [(name, document) for name, document in found if document is not None]

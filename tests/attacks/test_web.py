@@ -160,75 +160,59 @@ def test_connections_that_send_nothing_close_the_page_to_nobody(page: Page) -> N
     assert page.program.running
 
 
-VALUES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[1].textContent)'
-QUALITIES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[3].textContent)'
-GOOD = ",".join(["good, simulated"] * 4)
-
-
-CELLS = (
-    '[...document.querySelectorAll("#{} tr")]'
-    '.map((row) => [...row.querySelectorAll("td")].map((td) => td.textContent))'
-)
-STALE = "stale never oven/level is bad: line-down ("
+LIVE = 'document.body?.className === ""'
 LONG_AGO = "2026-01-02T03:04:05.000000Z"
 
 
-ACKNOWLEDGE = f"""
-for (const [id, value] of Object.entries({{token: "{TOKEN}", name: "Ana", alarm: "line:yard"}}))
-  document.getElementById(`acknowledge-${{id}}`).value = value;
-document.getElementById("acknowledge-form").requestSubmit()
-"""
+def texts(selector: str) -> str:
+    lines = "one.innerText.replace(/\\n+/g, '\\n')"
+    return f"[...document.querySelectorAll('{selector}')].map((one) => {lines})"
 
 
-WRITE_STEPS = f"""
-window.confirm = () => true;
-const text = JSON.stringify([...Array(40).keys()].map((n) => 60000 + n));
-for (const [id, value] of Object.entries({{token: "{TOKEN}", tag: "mixer/steps", value: text}}))
-  document.getElementById(`write-${{id}}`).value = value;
-document.getElementById("write-form").requestSubmit()
+SIGN_IN = f"""
+for (const [id, value] of Object.entries({{token: "{TOKEN}", by: "Ana"}}))
+  document.getElementById(id).value = value;
+document.getElementById("token-form").requestSubmit()
 """
+STEPS = json.dumps([60000 + number for number in range(40)])
 
 
 async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
     page: Page, tmp_path: Path
 ) -> None:
     async with browser(needs("chromium"), tmp_path) as tab:
-        await tab.open(f"http://127.0.0.1:{page.port}/#line=hall")
+        await tab.open(f"http://127.0.0.1:{page.port}/#lines")
+        await tab.until(f"{LIVE} && {texts('#wrong li')}.join().includes('line yard is down')")
+        stale = "stale\\nnever carried\\noven/level is bad: line-down ("
+        await tab.until(f"{texts('#transfers li')}.join().includes('{stale}')")
+        await tab.click('button[aria-label="wire of hall"]')
         await tab.until(
-            'document.body?.className === "" && !!document.querySelector("#devices tr")'
+            "/^[1-9]\\d* exchanges/.test(document.querySelector('.wire-sum')?.innerText)"
         )
-        assert "line yard is down" in await tab.value('document.querySelector("#wrong").innerText')
-        await tab.until(f'{CELLS.format("transfers")}[0]?.join(" ").startsWith("{STALE}")')
-        await tab.until('document.querySelector("#alarms").innerText.includes("line:yard")')
-        await tab.value(ACKNOWLEDGE)
+        await tab.value('location.hash = "#alarms"')
+        await tab.click('button[aria-label="acknowledge line:yard"]')
+        await tab.until('document.getElementById("sign-in").open')
+        await tab.value(SIGN_IN)
+        await tab.until(f"{texts('#alarms-list li')}.join().includes('acknowledged by Ana')")
+        await tab.value('location.hash = "#tags?device=mixer"')
         await tab.until(
-            'document.querySelector("#acknowledge-result").textContent.includes("by Ana, now ack")'
+            f"{texts('#space .quality')}.join() === 'simulated,simulated,simulated,simulated'"
         )
-        # By keyboard: the skip button leads to the devices, the button of the mixer to its values.
-        await tab.value('document.querySelector("[data-device=mixer]").focus()')
-        await tab.press("Enter")
-        await tab.until(f'{QUALITIES}.join() === "{GOOD}" && document.body.className === ""')
-        assert (await tab.value(VALUES))[2].isdigit()
-        await tab.until(
-            '/^[1-9]\\d* exchanges/.test(document.querySelector("#wire-sum").innerText)'
-        )
-        await tab.value(WRITE_STEPS)
-        await tab.until(
-            'document.querySelector("#write-result").textContent.includes("60039]: acknowledged")'
-        )
-        await tab.until(f'{VALUES}[3].startsWith("[60000, 60001,")')
-        assert (await tab.value(VALUES))[3].endswith(", 60027, …")  # the rest is in its title
-        trends = "document.querySelectorAll('#values button').length"
-        assert await tab.value(trends) == 1  # of the speed: a list has none
-        for width, height in ((1200, 900), (390, 800)):
-            await tab.look(width, height, dark=width < 600)
-            wide = await tab.value("document.documentElement.scrollWidth")
-            assert wide <= width  # no sideways scrolling
+        assert (await tab.value(texts("#space .value b")))[1].isdigit()
+        assert await tab.value("document.querySelectorAll('#space .actions a').length") == 3
+        await tab.click('button[aria-label="write mixer/steps"]')
+        await tab.until('document.activeElement.closest(".editor")')
+        await tab.type(STEPS)
+        for _ in range(2):
+            await tab.click(".editor button.main")
+        await tab.until(f"{texts('.editor .result')}[0].includes('60039]: acknowledged')")
+        await tab.until(f"{texts('#space .value')}[3].startsWith('[60000, 60001,')")
+        assert (await tab.value(texts("#space .value")))[3].endswith(", …")
         assert tab.errors == []
         page.program.end(signal.SIGKILL)
         await tab.until('document.body.className === "stale"')
-        assert await tab.value(QUALITIES) == 4 * ["not live"]
-        assert "not live since" in await tab.value('document.querySelector("#live").innerText')
+        assert await tab.value(texts("#space .quality")) == 4 * ["not live"]
+        assert "Not live since" in await tab.value('document.querySelector("#lost").innerText')
         await calls_and_transfers_are_shown(tab)
 
 
@@ -239,28 +223,20 @@ async def calls_and_transfers_are_shown(tab: Tab) -> None:
         documents["lines/far"] = calling()
         documents["transfers/2"] = transfer("carried", code="0", meaning="normal", time=LONG_AGO)
         documents["transfers/10"] = transfer("refused", why="251 is more than 250")
-        await tab.open(f"http://127.0.0.1:{client.port}/")
-        await tab.until(
-            f'document.body?.className === "" && {CELLS.format("transfers")}.length === 2'
-        )
-        assert await tab.value(CELLS.format("calls")) == [
-            ["idle for 4.0 s", "in 14 min", "BUSY", "7", "2"]
-        ]
-        [refused, carried] = await tab.value(CELLS.format("transfers"))
-        assert refused == ["refused", "never", "251 is more than 250"]
-        await tab.until(f"/^\\d+ d ago$/.test({CELLS.format('transfers')}[1][1])")
-        assert (carried[0], carried[2]) == ("carried", "0: normal")
-        titles = (
-            '[...document.querySelectorAll("#transfers th[scope=row]")].map((th) => th.innerText)'
-        )
-        assert (await tab.value(titles))[0] == "10: mixer/speed to oven/setpoint"
-        wrong = await tab.value('document.querySelector("#wrong").innerText')
+        await tab.open(f"http://127.0.0.1:{client.port}/#lines")
+        await tab.until(f"{LIVE} && {texts('#transfers li')}.length === 2")
+        [call] = await tab.value(texts("#calls li"))
+        assert "idle for 4.0 s" in call
+        assert "next call in 14 min, last result BUSY, 7 calls, 2 failed" in call
+        [refused, carried] = await tab.value(texts("#transfers li"))
+        assert refused.startswith("10: mixer/speed to oven/setpoint\nrefused\nnever carried")
+        assert "251 is more than 250" in refused
+        await tab.until(f"/carried\\n\\d+ d ago/.test({texts('#transfers li')}[1])")
+        assert "0: normal" in carried
+        wrong = " ".join(await tab.value(texts("#wrong li")))
         assert "transfer 10 waits for oven" in wrong  # which is silent
-        assert "line far: the last call failed: modem:/dev/ttyS0: BUSY" in wrong
-        fits = "(({scrollWidth, clientWidth}) => scrollWidth <= clientWidth)"
-        for name in ("calls", "transfers"):
-            assert await tab.value(f'{fits}(document.querySelector("#{name}").closest(".wide"))')
+        assert "line far: the last call failed" in wrong
         del documents["transfers/10"], documents["lines/far"]  # a reload
-        await tab.until(f"{CELLS.format('transfers')}.length === 1")
+        await tab.until(f"{texts('#transfers li')}.length === 1")
         assert await tab.value('document.querySelector("#calls-section").hidden')
         assert tab.errors == []

@@ -85,6 +85,37 @@ class Tab:
             text = {"text": "\r"} if key == "Enter" and kind == "keyDown" else {}
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **text)
 
+    async def type(self, text: str) -> None:
+        await self.call("Input.insertText", text=text)
+
+    async def click(self, selector: str) -> None:
+        """Clicks the first element of a selector, when it is there."""
+        await self.until(f"!!document.querySelector({json.dumps(selector)})")
+        await self.value(f"document.querySelector({json.dumps(selector)}).click()")
+
+    async def drag(self, selector: str, begin: float, end: float) -> None:
+        """Drags the mouse across an element, from one share of its width to another."""
+        rect = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        left, wide, middle = await self.value(
+            f"(({{x, width, y, height}}) => [x, width, y + height / 2])({rect})"
+        )
+        for kind, share in (
+            ("mouseMoved", begin),
+            ("mousePressed", begin),
+            ("mouseMoved", end),
+            ("mouseReleased", end),
+        ):
+            button = {} if kind == "mouseMoved" and share == begin else {"button": "left"}
+            await self.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=left + wide * share,
+                y=middle,
+                clickCount=1,
+                buttons=1 if button else 0,
+                **button,
+            )
+
     async def screenshot(self, path: Path) -> None:
         answer = await self.call("Page.captureScreenshot", format="png")
         path.write_bytes(base64.b64decode(answer["data"]))

@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
@@ -92,6 +92,7 @@ class PlainNorth:
         self.began = asyncio.Event()
         self.gate = asyncio.Event()  # writes wait for it
         self.gate.set()
+        self.orders: Callable[[str, bytes, str | None], Awaitable[bytes]] | None = None
 
     async def documents(self, max_age: float) -> Documents:
         status = {
@@ -129,6 +130,8 @@ class PlainNorth:
         self, part: str, path: str, data: bytes, by: str, arrived: float
     ) -> bytes | Failure:
         self.written.append((path, data, by))
+        if self.orders is not None:
+            return await self.orders(path, data, by)
         ending = self.endings.get(data, Failure(Problem.NOTHING_TO_ACKNOWLEDGE, "it is normal"))
         return ending if isinstance(ending, Failure) else b"{}"
 
@@ -173,8 +176,8 @@ class Client:
         return Answer(int(first.split()[1]), found, rest)
 
 
-def local(host: str = "127.0.0.1", **settings: Any) -> WebSection:
-    return WebSection.model_construct(listen=(host, free_port()), **settings)
+def local(host: str = "127.0.0.1", port: int | None = None, **settings: Any) -> WebSection:
+    return WebSection.model_construct(listen=(host, port or free_port()), **settings)
 
 
 def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None) -> Core:
@@ -185,7 +188,7 @@ def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None
 
 @asynccontextmanager
 async def serving(**settings: Any) -> AsyncIterator[Client]:
-    """Serves at a free port; `settings`: those of `WebSection`, `history`, `plant`."""
+    """Serves at a free port; `settings`: those of `WebSection`, `port`, `history`, `plant`."""
     history, plant = settings.pop("history", None), settings.pop("plant", None) or mixer()
     config, north = local(**settings), PlainNorth()
     server = Server(config, core_of(plant, north, history))

@@ -6,9 +6,8 @@ are made on threads, because those of a large plant take long.
 
 import asyncio
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
-from itertools import islice
 from typing import Any
 
 from aiohttp import web
@@ -16,7 +15,6 @@ from aiohttp import web
 from gateway.contract import payload
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.interfaces import History
-from gateway.contract.meta import meta_fields
 from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Now
@@ -38,6 +36,7 @@ from gateway.parts.web.routes import (
     raw,
 )
 from gateway.parts.web.schemas import ref
+from gateway.parts.web.tag_list import TagList
 from gateway.plant.part import Core
 from gateway.plant.threads import off_loop
 from gateway.tags import Tag
@@ -68,7 +67,9 @@ _AFTER_DEVICE = Word("after", "Name of the last device of the page before")
 _AFTER_TAG = Word("after", "Last tag of the page before")
 _OF_LINE = Word("line", "Only devices of this line")
 _OF_DEVICE = Word("device", "Only tags of this device")
-_FIND = Word("find", "Only tags whose name contains this text")
+_FIND = Word("find", "Only tags with all these words in their key or description")
+_CHOSEN = Word("tags", "Only these: keys with commas, also with *; empty: those of the overview")
+_SKIP = Count("skip", "So many tags are left out before the page", 0, 10**8, 0)
 _TAG = Word("tag", "device/name", required=True)
 _WRITTEN = Word("tag", "device/name; or a device, to write several of its tags", required=True)
 # `question` parses them, as for Zenoh.
@@ -85,11 +86,11 @@ _QUESTION = (
 class Api:
     """The handlers."""
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: Core, tags: TagList) -> None:
         self._plant = core.plant
         self._north = core.north
         self._core = core
-        self._known: tuple[object, Mapping[str, Sequence[Tag]]] = (None, {})
+        self._list = tags
         self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
         self._history_places = Places(HISTORY_WAITING, HISTORY_OF_CLIENT, "queries of history")
 
@@ -129,7 +130,7 @@ class Api:
                 "/api/tags",
                 self._tags,
                 "Tags with their values, in pages, in the order of the file",
-                parameters=(_OF_DEVICE, _FIND, _AFTER_TAG, LIMIT),
+                parameters=(_OF_DEVICE, _FIND, _CHOSEN, _AFTER_TAG, _SKIP, LIMIT),
                 reply=ref("Tags"),
                 errors={400: "A wrong limit", 404: "No such device"},
             ),
@@ -164,14 +165,6 @@ class Api:
                 },
             ),
         ]
-
-    @property
-    def _devices(self) -> Mapping[str, Sequence[Tag]]:
-        """The tags by device, made again after a reload."""
-        devices = self._plant.devices()
-        if self._known[0] is not devices:
-            self._known = devices, {device.name: tuple(device.tags) for device in devices}
-        return self._known[1]
 
     async def _status(self, _: web.Request) -> web.Response:
         return as_json(overview(await self._north.documents(STATE_AGE)))
@@ -213,35 +206,26 @@ class Api:
         return as_json(document)
 
     async def _tags(self, request: web.Request) -> web.Response:
-        limit, after = LIMIT.of(request), _AFTER_TAG.of(request)
-        device, find = _OF_DEVICE.of(request), (_FIND.of(request) or "").lower()
-        if device is not None and device not in self._devices:
+        limit, skip, after = LIMIT.of(request), _SKIP.of(request), _AFTER_TAG.of(request)
+        device, find = _OF_DEVICE.of(request), _FIND.of(request) or ""
+        chosen, known = _CHOSEN.of(request), self._list
+        if device is not None and not known.has_device(device):
             return answer(404, f"there is no device {payload.short(device)}")
 
         def page() -> object:
-            found = self.select(device, find, after, limit + 1)
-            more = len(found) > limit
-            tags = [{"tag": tag.key, **self._fields(tag)} for tag in found[:limit]]
-            return {"tags": tags, "next": tags[-1]["tag"] if more else None}
+            if chosen is None:
+                found = known.select(device, find, after)
+            else:
+                found = known.chosen(chosen or None)
+            shown = [known.fields(tag) for tag in found[skip : skip + limit]]
+            more = len(found) > skip + limit
+            return {
+                "tags": shown,
+                "next": shown[-1]["tag"] if more else None,
+                "total": len(found),
+            }
 
         return await json_off_loop(page)
-
-    def select(self, device: str | None, find: str, after: str | None, limit: int) -> list[Tag]:
-        """Returns tags in the order of the file, after the tag `after`."""
-        known = self._devices
-        names = [*known] if device is None else [device]
-        if after is not None and (start := after.partition("/")[0]) in names:
-            names = names[names.index(start) :]
-        tags = (tag for name in names for tag in known.get(name, ()))
-        if after is not None:
-            for tag in tags:
-                if tag.key == after:
-                    break
-        matching = (tag for tag in tags if find in tag.key.lower())
-        return list(islice(matching if find else tags, limit))
-
-    def _fields(self, tag: Tag) -> Mapping[str, object]:
-        return {**payload.sample_fields(self._plant.sample(tag)), **meta_fields(tag)}
 
     async def _samples(self, request: web.Request) -> web.Response:
         key = _TAG.of(request) or ""

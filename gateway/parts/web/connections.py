@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
-from typing import cast
+from typing import NamedTuple, cast
 
 from aiohttp import web
 
@@ -91,6 +91,13 @@ def client_of(transport: asyncio.BaseTransport | None) -> str:
     """Returns the address of the client; empty if the connection was closed."""
     peer = transport.get_extra_info("peername") if transport is not None else None
     return str(peer[0]) if peer else ""
+
+
+class Who(NamedTuple):
+    """The client of a page."""
+
+    name: str  # of its token; empty without a valid one
+    may_write: bool  # with a token
 
 
 class Place:

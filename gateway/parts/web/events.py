@@ -1,4 +1,4 @@
-"""Server-sent events for the status page: state, values of one device, exchanges of one line.
+"""Server-sent events for the status page: state, chosen values, exchanges of one line.
 
 Nothing is queued for a client. Each event is made from the current state when the client has taken
 the one before, so a slow client gets fewer events, and none that is old. A client that takes
@@ -6,7 +6,6 @@ nothing for `SLOW` seconds is dropped.
 """
 
 import asyncio
-import json
 import time
 from collections import ChainMap, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -18,10 +17,11 @@ import orjson
 from aiohttp import web
 
 from gateway.contract import payload
-from gateway.contract.faults import Documents, below, transfers
-from gateway.parts.web.api import Api, overview
-from gateway.parts.web.connections import Places
+from gateway.contract.faults import Documents, below, causes, transfers
+from gateway.parts.web.api import overview
+from gateway.parts.web.connections import Places, Who
 from gateway.parts.web.routes import Route, Word, drop
+from gateway.parts.web.tag_list import TagList
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
 from gateway.tags import Sample, Tag
@@ -34,12 +34,10 @@ VALUES_EVERY = 1.0
 STATE_EVERY = 2.0
 LOAD_EVERY = 5.0  # as often as the status is published: it costs nothing more
 KEPT_LOADS = 360  # half an hour
-TAGS_SHOWN = 200  # of one device
 _BY_NAME = ("devices", "transfers")  # of the state: a page gets their changes
 MOST_SENTENCES = 50  # about what is wrong, and about what to look at
 _LINE = Word("line", "With the exchanges of this line")
-_DEVICE = Word("device", "With the values of this device")
-_AFTER = Word("after", "From after this tag")
+_CHOSEN = Word("tags", "With these values: keys with commas; left out: those of the overview")
 
 
 class Loads:
@@ -83,13 +81,13 @@ class Events:
     """The handler of `/api/events`."""
 
     def __init__(
-        self, core: Core, api: Api, loads: Loads, allowed: Callable[[web.Request], bool]
+        self, core: Core, tags: TagList, loads: Loads, who: Callable[[web.Request], Who | None]
     ) -> None:
-        """`allowed`: False when the token of a request was withdrawn."""
+        """`who`: the client; None when its token was withdrawn."""
         self._core = core
-        self._api = api
+        self._tags = tags
         self.loads = loads
-        self._allowed = allowed
+        self._who = who
         self.wires = Wires(core.plant)
         self._pages = Places(MOST_PAGES, MOST_PAGES_OF_CLIENT, "pages")
         self._state: tuple[Documents, dict[str, Any]] = ({}, {})
@@ -100,7 +98,7 @@ class Events:
                 "/api/events",
                 self.handle,
                 "Server-sent events of the status page; their content may change",
-                parameters=(_LINE, _DEVICE, _AFTER),
+                parameters=(_LINE, _CHOSEN),
                 kind="text/event-stream",
                 done="Events",
             )
@@ -114,9 +112,7 @@ class Events:
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
-        tags = None
-        if device := _DEVICE.of(request):
-            tags = self._api.select(device, "", _AFTER.of(request), TAGS_SHOWN)
+        tags = self._tags.chosen(_CHOSEN.of(request))
         with (
             self._pages.taken(request.transport),
             self.wires.watched(_LINE.of(request) or "") as recorder,
@@ -125,7 +121,7 @@ class Events:
             response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
             await response.prepare(request)
             page = Page(self._core, self, tags, recorder)
-            await _send(request, response, page, self._allowed)
+            await _send(request, response, page, self._who)
         return response
 
 
@@ -133,11 +129,11 @@ async def _send(
     request: web.Request,
     response: web.StreamResponse,
     page: "Page",
-    allowed: Callable[[web.Request], bool],
+    who: Callable[[web.Request], Who | None],
 ) -> None:
     """Sends until the client leaves, takes nothing, or has no valid token any more."""
-    while allowed(request):
-        data = await page.next()
+    while (client := who(request)) is not None:
+        data = await page.next(client)
         try:
             async with asyncio.timeout(SLOW):
                 await response.write(data)
@@ -153,7 +149,7 @@ class Page:
 
     _core: Core
     _events: Events
-    _tags: Sequence[Tag] | None
+    _tags: Sequence[Tag]
     _recorder: Recorder | None
     _exchange: int = 0  # the number of the last one
     _load: int = 0  # the number of the last measurement
@@ -162,19 +158,19 @@ class Page:
     _values_due: float = 0.0
     _state_due: float = 0.0
 
-    async def next(self) -> bytes:
+    async def next(self, client: Who) -> bytes:
         """Returns the events that are due; at least the time."""
         loop = asyncio.get_running_loop()
         events = []
         if self._state_due <= loop.time():
             documents = await self._core.north.documents(STATE_EVERY)
             self._state_due = loop.time() + STATE_EVERY
-            events.append(_event("state", self._state(documents)))
+            events.append(_event("state", self._state(documents, client)))
             loads = self._events.loads
             if self._load < loads.number:
                 events.append(_event("loads", loads.since(self._load)))
                 self._load = loads.number
-        if self._tags is not None and self._values_due <= loop.time():
+        if self._values_due <= loop.time():
             self._values_due = loop.time() + VALUES_EVERY
             events.append(_event("values", self._values(self._tags)))
         if self._recorder is not None and (new := self._recorder.since(self._exchange)):
@@ -186,11 +182,11 @@ class Page:
         events.append(_event("time", [round(time.time() * 1000), round(loop.time() * 1000)]))
         return b"".join(events)
 
-    def _state(self, documents: Documents) -> dict[str, Any]:
+    def _state(self, documents: Documents, client: Who) -> dict[str, Any]:
         whole = self._events.state(documents)
         changed = {name: _changes(self._shown.get(name, {}), whole[name]) for name in _BY_NAME}
         self._shown = {name: whole[name] for name in _BY_NAME}
-        return {**whole, "ready": self._core.north.is_ready, **changed}
+        return {**whole, "ready": self._core.north.is_ready, "you": [*client], **changed}
 
     def _values(self, tags: Sequence[Tag]) -> list[list[object]]:
         """Returns the values that changed, or were read again: the text of the value as in JSON,
@@ -203,17 +199,14 @@ class Page:
             self._sent[tag] = sample
             fields = payload.sample_fields(sample)
             known = fields["value"]
-            if isinstance(known, tuple):
-                text = json.dumps(known)  # with spaces: a browser breaks the line there
-            else:
-                text = known if isinstance(known, str) else orjson.dumps(known).decode()
-            if name := fields.get("text"):
-                text = f"{name} ({text})"
+            text = known if isinstance(known, str) else orjson.dumps(known).decode()
             why: str = fields.get("origin") or ""
             good = fields["quality"] != "bad"
             if fields["quality"] == "bad":
                 why = " ".join(filter(None, (fields["reason"], fields.get("detail"))))
-            found.append([tag.name, text if good else "", good, sample.time // 10**6, why])
+            found.append(
+                [tag.key, text if good else "", good, sample.time // 10**6, why, fields.get("text")]
+            )
         return found
 
 
@@ -231,7 +224,7 @@ def _state(documents: Documents) -> dict[str, Any]:
         "lines": [
             [
                 *(name, one["open"], one["trouble"], one["expected"]["load"]),
-                one["measured"]["requests_per_second"],
+                *(one["measured"]["requests_per_second"], *causes(name, documents)),
             ]
             for name, one in below("lines/", documents)
         ],

@@ -15,7 +15,7 @@ from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
 from gateway.contract.access.named_secrets import NamedSecrets
-from gateway.parts.web.connections import Connections, Places
+from gateway.parts.web.connections import Connections, Places, Who
 from gateway.parts.web.routes import answer, send
 from gateway.parts.web.settings import WebSection
 
@@ -27,7 +27,8 @@ MOST_SCRAPES_OF_CLIENT = 4
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
-        "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        "img-src 'self' data:; manifest-src 'self'; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'none'"
     ),
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -93,9 +94,12 @@ class Guard:
             return refusal
         return None
 
-    def allows(self, request: web.Request) -> bool:
-        """False when the token of a request was withdrawn since."""
-        return not self._needs_token(request) or bool(self._name(request))
+    def who(self, request: web.Request) -> Who | None:
+        """Returns the client of a request; None when its token was withdrawn since."""
+        name = self._name(request)
+        if self._needs_token(request) and not name:
+            return None
+        return Who(name, self._tokens is not None)
 
     def _needs_token(self, request: web.Request) -> bool:
         return request.method != "GET" or self._reads_need_token

@@ -157,7 +157,13 @@ SCHEMAS: Mapping[str, Schema] = {
         ),
         _STATUS_DOCUMENT,
     ),
-    "Tags": _record({"tags": _list("Tag"), "next": _NEXT}),
+    "Tags": _record(
+        {
+            "tags": _list("Tag"),
+            "next": _NEXT,
+            "total": _about(INTEGER, "Tags of the whole list"),
+        }
+    ),
     "Tag": {
         **_record(
             {
@@ -167,6 +173,7 @@ SCHEMAS: Mapping[str, Schema] = {
                 "every": NUMBER,
                 "history": FLAG,
                 "write": _about(_OBJECT_OR_NULL, "null: it cannot be written"),
+                "alarm": _about(_OBJECT_OR_NULL, "Its limits by level; null: it has none"),
             },
             {
                 **_SAMPLE_MORE,

@@ -5,6 +5,7 @@ dropped, and answers of a large plant are made on threads.
 """
 
 import asyncio
+import gzip
 import json
 import logging
 import socket
@@ -23,6 +24,7 @@ from gateway.parts.web.events import Events, Loads
 from gateway.parts.web.guard import Guard, add_headers
 from gateway.parts.web.routes import Route
 from gateway.parts.web.settings import WebSection
+from gateway.parts.web.tag_list import TagList
 from gateway.plant.part import Core, Routed
 from gateway.plant.threads import off_loop
 
@@ -32,10 +34,13 @@ IDLE = 15.0  # seconds without a whole request until a connection is closed
 AGAIN = 10.0  # seconds until the address is tried again
 SCRAPE_AGE = 1.0  # seconds that the state in the metrics may be old
 _FOLDER = Path(__file__).parent / "assets"
-_FILES = {
-    "/": ("page.html", "text/html"),
-    "/page.js": ("page.js", "text/javascript"),
-    "/page.css": ("page.css", "text/css"),
+_KINDS = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+    ".webmanifest": "application/manifest+json",
+    ".txt": "text/plain",
 }
 _BACKLOG = 128  # connections that the system keeps until they are accepted
 _HEADER = 8190  # bytes of one line
@@ -60,11 +65,12 @@ class Server:
     def __init__(self, config: WebSection, core: Core) -> None:
         self._config = config
         self._core = core
-        self._api = Api(core)
+        tags = TagList(core.plant, config.overview)
+        self._api = Api(core, tags)
         self._loads = Loads(core)
         self._connections = Connections()
         guard = Guard(config, self._connections)
-        events = Events(core, self._api, self._loads, guard.allows)
+        events = Events(core, tags, self._loads, guard.who)
         routes = [
             *self._api.routes(),
             *AlarmApi(core).routes(),
@@ -196,15 +202,26 @@ class Server:
 
 
 def _page() -> list[Route]:
+    """Returns the routes of the files of the page; `page.html` is at `/`."""
     return [
-        _file(path, (_FOLDER / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()
+        _file(
+            "/" if file.suffix == ".html" else f"/{file.name}",
+            file.read_bytes(),
+            _KINDS[file.suffix],
+        )
+        for file in sorted(_FOLDER.iterdir())
     ]
 
 
 def _file(path: str, body: bytes, kind: str) -> Route:
     """Returns the route of a file: it holds no value, so it is open."""
+    small = gzip.compress(body, mtime=0)
 
-    async def asset(_: web.Request) -> web.Response:
-        return web.Response(body=body, content_type=kind, charset="utf-8")
+    async def asset(request: web.Request) -> web.Response:
+        found = web.Response(body=body, content_type=kind, charset="utf-8")
+        found.headers["Vary"] = "Accept-Encoding"
+        if "gzip" in request.headers.get("Accept-Encoding", ""):
+            found.body, found.headers["Content-Encoding"] = small, "gzip"
+        return found
 
     return Route(path, asset, is_open=True)

@@ -1,11 +1,12 @@
 """The section `web` of the file."""
 
+from fnmatch import fnmatchcase
 from ipaddress import ip_address
 from pathlib import Path
 
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
-from gateway.config.settings.setting_types import FilePath, HostName, WebAddress
+from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress
 
 
 class WebSection(Section):
@@ -15,6 +16,9 @@ class WebSection(Section):
     """The address of the page."""
     tokens_file: FilePath | None = None
     """One line `name:token` for each client; without it nothing can be written."""
+    overview: list[Text] = []
+    """Tags that the page shows first, in this order: keys, also with *; left out: those with an
+    alarm, a history or a unit."""
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
 
@@ -44,6 +48,9 @@ def _place(settings: WebSection | None, place: Place) -> WebSection | None:
             f"other machines can reach {settings.host}: name a tokens_file too (see docs/page.md), "
             f"or listen on 127.0.0.1:{settings.port}",
         )
+    for number, pattern in enumerate(settings.overview):
+        if not any(fnmatchcase(tag.key, pattern) for tag in place.tags):
+            place.mistakes.add(("web", "overview", number), f"there is no tag {pattern}")
     tokens = place.existing(settings.tokens_file, "web", "tokens_file")
     return settings.model_copy(update={"tokens_file": tokens})
 

@@ -1,0 +1,257 @@
+// What is wrong, the lines with their causes, devices folded below; calls and transfers.
+
+import { byId, clock, h, keyed, put, span, style, svg } from "./dom.js";
+import { gateway, now, on } from "./stream.js";
+import { wireOf } from "./wire.js";
+
+const KEPT = 360; // loads of a line: half an hour
+const SHORT = 4; // sentences of the overview before the rest is folded
+const LINES = 8; // of the overview
+const SHOWN = 200; // devices or transfers
+const ORDER = { silent: 0, failing: 1, starting: 2, up: 3 };
+
+export const devices = new Map(); // [line, state, why] by name
+const loads = new Map();
+const transfers = new Map();
+let lines = [];
+let simulated = [];
+let all = false; // every sentence is shown
+
+on("begin", () => {
+  loads.clear();
+  begun = true;
+});
+let begun = false; // the next state has all devices and transfers
+
+on("state", (state) => {
+  if (begun) for (const known of [devices, transfers]) known.clear();
+  begun = false;
+  const waiting = state.standby ? `, ${state.standby}` : "";
+  const history = state.history === null ? "no history" : state.history === "ok" ? "history ok" : "history not ok";
+  put("name", state.name);
+  put("about", `plc-gateway ${state.version}, up ${span(state.up)}, ${state.tags} tags, ${state.links.length} Zenoh ${state.links.length === 1 ? "link" : "links"}, ${history}${waiting}${state.you[1] ? "" : ", read only"}`);
+  lines = state.lines;
+  simulated = state.simulated;
+  merge(devices, state.devices);
+  merge(transfers, state.transfers);
+  showWrong(state);
+  showLines();
+  showCalls(state.calls);
+  showTransfers();
+});
+
+on("loads", (added) => {
+  for (const [name, more] of Object.entries(added)) loads.set(name, [...(loads.get(name) ?? []), ...more].slice(-KEPT));
+  showLines();
+});
+
+function merge(into, changes) {
+  for (const [name, one] of Object.entries(changes)) {
+    if (one === null) into.delete(name);
+    else into.set(name, one);
+  }
+}
+
+function showWrong(state) {
+  const sentences = [
+    ...(state.ready ? [] : [["warning", "The gateway does not serve its plant: it starts, or is the standby."]]),
+    ...state.faults.map((text) => ["wrong", text]),
+    ...state.warnings.map((text) => ["warning", text]),
+    ...(state.more ? [["warning", `and ${state.more} more`]] : []),
+  ];
+  const count = state.faults.length;
+  put("fault-count", String(count));
+  byId("fault-count").hidden = !count;
+  const wanted = count + Number(byId("alarm-count").textContent || 0);
+  document.title = `${wanted ? `(${wanted}) ` : ""}${state.name}`;
+  const listed = all ? sentences : sentences.slice(0, SHORT);
+  const list = byId("wrong");
+  keyed(list, listed, ([, text]) => text.replace(TIMES, ""), ([, text]) => {
+    const item = h("li");
+    item.head = h("b");
+    item.rest = h("span");
+    const { head, rest } = parted(text);
+    const isShort = !rest || (innerWidth >= 1000 && sentences.length <= SHORT) || (head + rest).length < innerWidth / 12;
+    item.colon = isShort && rest ? ": " : "";
+    item.append(isShort ? h("p", {}, item.head, item.rest) : h("details", {}, h("summary", {}, item.head), item.rest));
+    return item;
+  }, (item, [kind, text]) => {
+    const { head, rest } = parted(text);
+    style(item, kind);
+    put(item.head, head + item.colon);
+    put(item.rest, rest);
+  });
+  if (!sentences.length) list.append(h("li", { className: "well" }, "Nothing is wrong."));
+  if (sentences.length > SHORT) {
+    const fold = () => {
+      all = !all;
+      showWrong(state);
+    };
+    list.append(h("li", { className: "fold" }, h("button", { type: "button", className: "link", onclick: fold }, all ? "Show less" : `and ${sentences.length - SHORT} more`)));
+  }
+}
+
+const TIMES = / \(for .*?\)|\d+% of the last \d+ requests/g; // what changes in a sentence
+
+// A sentence in two: what is wrong, and its cause.
+function parted(text) {
+  const [, head, , rest = ""] = text.match(/^(line \S+: [^:]*|[^:]*)(: (.*))?$/s) ?? [null, text];
+  return { head, rest };
+}
+
+// -- lines --
+
+function stateOf([name, open]) {
+  return open ? (simulated.includes(name) ? "simulated" : "open") : "down";
+}
+
+// Returns [kind, sentence] of each cause.
+function causesOf([name, open, trouble, , , faults, warnings]) {
+  const own = new RegExp(`^line ${name.replace(/[.*+?^${}()|[\]\\]/g, "\\$&")}(: | is (down: )?|, )`);
+  const found = [...faults.map((text) => ["wrong", text.replace(own, "")]), ...warnings.map((text) => ["warning", text.replace(own, "")])];
+  return found.length || open ? found : [["warning", trouble || "not opened"]];
+}
+
+function showLines() {
+  const worst = [...lines].sort((a, b) => Number(a[1]) - Number(b[1]) || b[5].length - a[5].length || b[6].length - a[6].length);
+  if (byId("view-lines").hidden) {
+    keyed(byId("lines-short"), worst.slice(0, LINES), ([name]) => name, makeShort, showShort);
+    if (worst.length > LINES) byId("lines-short").append(h("li", {}, h("a", { href: "#lines" }, `and ${worst.length - LINES} more`)));
+  } else {
+    keyed(byId("lines-list"), worst, ([name]) => name, makeLine, showLine);
+  }
+}
+
+addEventListener("hashchange", showLines);
+
+function makeShort([name]) {
+  const row = h("li", { className: "line" });
+  row.state = h("span");
+  row.load = h("span", { className: "age" });
+  row.cause = h("p", { className: "cause" });
+  row.append(h("a", { href: `#lines?line=${encodeURIComponent(name)}` }, name), row.state, row.load, row.cause);
+  return row;
+}
+
+function showShort(row, line) {
+  const of = ownDevices(line[0]);
+  const up = of.filter(([, [, state]]) => state === "up").length;
+  const [[kind, cause] = ["soft", ""]] = causesOf(line);
+  put(row.state, `${stateOf(line)} · ${up} of ${of.length} ${of.length === 1 ? "device" : "devices"} up`);
+  style(row.state, kind);
+  put(row.load, line[1] ? load(line[0]) : "");
+  put(row.cause, line[1] ? parted(cause).head : cause);
+  row.cause.title = cause;
+}
+
+function ownDevices(line) {
+  return [...devices].filter(([, [of]]) => of === line).sort(([a, [, one]], [b, [, other]]) => (ORDER[one] ?? 0) - (ORDER[other] ?? 0) || a.localeCompare(b));
+}
+
+const load = (name) => {
+  const last = loads.get(name)?.at(-1);
+  return last === undefined ? "" : `${Math.round(last * 100)} %`;
+};
+
+function makeLine([name]) {
+  const card = h("li", { className: "card line" });
+  card.state = h("span");
+  card.causes = h("ul", { className: "causes" });
+  card.chart = svg("svg", { viewBox: "0 0 360 22", preserveAspectRatio: "none", class: "load", role: "img" });
+  card.chart.append(svg("polyline"));
+  card.load = h("span", { className: "soft" });
+  card.summary = h("summary");
+  card.devices = h("ul", { className: "rows" });
+  card.wire = h("div");
+  card.fold = h("details", { ontoggle: () => showDevices(card, name) }, card.summary, card.devices);
+  card.button = h("button", { type: "button", className: "quiet", "aria-label": `wire of ${name}`, onclick: () => wireOf(name, card.wire, card.button) }, "Wire");
+  card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
+  return card;
+}
+
+function showLine(card, line) {
+  const [name, open, , expected, rate] = line;
+  put(card.state, stateOf(line));
+  style(card.state, `pill ${open ? "good" : "wrong"}`);
+  keyed(card.causes, causesOf(line), ([, text]) => text.replace(TIMES, ""), () => {
+    const item = h("li");
+    item.head = h("b");
+    item.rest = h("span");
+    item.append(item.head, item.rest);
+    return item;
+  }, (item, [kind, text]) => {
+    const { head, rest } = parted(text);
+    style(item, kind);
+    put(item.head, rest ? `${head}: ` : head);
+    put(item.rest, rest);
+  });
+  const known = loads.get(name) ?? [];
+  const step = 360 / Math.max(60, known.length); // five minutes at least
+  card.chart.firstChild.setAttribute("points", known.map((share, at) => `${360 - (known.length - 1 - at) * step},${20 - share * 18}`).join(" "));
+  card.chart.setAttribute("aria-label", `load of ${name}, highest ${Math.round(Math.max(0, ...known) * 100)} %`);
+  put(card.load, `load ${load(name) || "–"}, expected ${Math.round(expected * 100)} %${rate === null ? "" : `, ${rate.toFixed(1)} requests/s`}`);
+  const of = ownDevices(name);
+  const up = of.filter(([, [, state]]) => state === "up").length;
+  put(card.summary, `${of.length} ${of.length === 1 ? "device" : "devices"}, ${up} up`);
+  showDevices(card, name, of);
+}
+
+function showDevices(card, name, of = ownDevices(name)) {
+  if (!card.fold.open) return;
+  keyed(card.devices, of.slice(0, SHOWN), ([device]) => device, ([device]) => {
+    const row = h("li", { className: "device" });
+    row.state = h("span");
+    row.why = h("p", { className: "cause" });
+    row.append(h("a", { href: `#tags?device=${encodeURIComponent(device)}` }, device), row.state, row.why);
+    return row;
+  }, (row, [, [, state, why]]) => {
+    put(row.state, state);
+    style(row.state, state);
+    put(row.why, why);
+  });
+  if (of.length > SHOWN) card.devices.append(h("li", { className: "soft" }, `and ${of.length - SHOWN} more: use the search`));
+}
+
+// -- calls and transfers --
+
+function showCalls(calls) {
+  byId("calls-section").hidden = !calls.length;
+  keyed(byId("calls"), calls, ([line]) => line, ([line]) => {
+    const row = h("li", { className: "device" });
+    row.state = h("span");
+    row.more = h("p", { className: "cause" });
+    row.append(h("b", {}, line), row.state, row.more);
+    return row;
+  }, (row, [, state, since, next, result, made, failed]) => {
+    put(row.state, since === null ? state : `${state} for ${span(since)}`);
+    style(row.state, state);
+    put(row.more, [next === null ? "" : `next call in ${span(next)}`, result && `last result ${result}`, `${made} calls, ${failed} failed`].filter(Boolean).join(", "));
+  });
+}
+
+const STATES = { unclear: 0, refused: 1, stale: 2, waiting: 3, starting: 4, carried: 5 };
+
+function showTransfers() {
+  byId("transfers-section").hidden = !transfers.size;
+  if (!transfers.size || byId("view-lines").hidden) return;
+  const sorted = [...transfers].sort(([a, one], [b, other]) => STATES[one[2]] - STATES[other[2]] || a - b);
+  keyed(byId("transfers"), sorted.slice(0, SHOWN), ([number, [from, to]]) => `${number} ${from} ${to}`, ([number, [from, to]]) => {
+    const row = h("li", { className: "device" });
+    row.state = h("span");
+    row.when = h("span", { className: "age" });
+    row.why = h("p", { className: "cause" });
+    row.append(h("b", {}, `${number}: ${from} to ${to}`), row.state, row.when, row.why);
+    return row;
+  }, (row, [, [, , state, code, time, why]]) => {
+    put(row.state, state);
+    style(row.state, state);
+    const at = Date.parse(time);
+    put(row.when, !time ? "never carried" : now() ? `${span(Math.max(0, (now() - at) / 1000))} ago` : "");
+    row.when.title = time ? clock(at) : "";
+    put(row.why, [why, code].filter(Boolean).join(" · "));
+  });
+  const working = sorted.filter(([, one]) => one[2] === "carried").length;
+  put("transfer-count", `${working} of ${sorted.length} carry their value${sorted.length > SHOWN ? `; ${SHOWN} are shown` : ""}`);
+}
+
+on("tick", () => gateway.live && showTransfers());

@@ -1,0 +1,267 @@
+"""The page in a real browser: search, trends, alarms, writes, a lost connection, 50,000 tags."""
+
+import json
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from gateway.tags import AlarmRule, Level, Reason, WriteResult, WriteRule, bad, good
+from tests.conftest import needs
+from tests.e2e.processes import free_port
+from tests.history.recorded import SPEED, history
+from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
+from tests.web.browser import Tab, browser
+from tests.web.serving import TOKEN, Client, serving
+
+LIVE = 'document.body?.className === ""'
+SECOND = 10**9
+EVIL = "<img src=x onerror=alert(1)>"
+
+
+@pytest.fixture
+async def tab(tmp_path: Path) -> AsyncIterator[Tab]:
+    async with browser(needs("chromium"), tmp_path / "profile") as found:
+        await found.look(1366, 768)
+        yield found
+        assert found.errors == []
+
+
+def text(selector: str) -> str:
+    return f"(document.querySelector({json.dumps(selector)})?.innerText ?? '')"
+
+
+def texts(selector: str) -> str:
+    return f"[...document.querySelectorAll({json.dumps(selector)})].map((one) => one.innerText)"
+
+
+async def opened(tab: Tab, client: Client, view: str = "overview") -> None:
+    await tab.open(f"http://127.0.0.1:{client.port}/#{view}")
+    await tab.until(LIVE)
+
+
+def oven() -> PlainPlant:
+    """An oven whose temperature is in alarm, with a setpoint."""
+    plant = PlainPlant(
+        PlainDevice(
+            "oven",
+            (
+                tag(
+                    "oven",
+                    "temperature",
+                    unit="°C",
+                    scale=0.1,
+                    alarm=AlarmRule({Level.HIGH: 80.0}, text="Oven too hot"),
+                ),
+                tag("oven", "setpoint", unit="°C", write=WriteRule(min=20, max=250)),
+                tag("oven", "power", description=EVIL),
+            ),
+        )
+    )
+    hot = plant.now("oven/temperature", 91.5)
+    plant.now("oven/setpoint", 85)
+    plant.alarms.judge([hot])
+    return plant
+
+
+async def sign_in(tab: Tab) -> None:
+    await tab.until('document.getElementById("sign-in").open')
+    for name, value in (("token", TOKEN), ("by", "Ana")):
+        await tab.value(f'document.getElementById("{name}").value = "{value}"')
+    await tab.value('document.getElementById("token-form").requestSubmit()')
+    await tab.until('!document.getElementById("sign-in").open')
+
+
+async def test_values_are_shown_first_with_unit_decimals_limits_and_alarm(tab: Tab) -> None:
+    async with serving(plant=oven()) as client:
+        await opened(tab, client)
+        await tab.until(f"{texts('.tile .value')}.length === 3 && !document.querySelector('.old')")
+        assert await tab.value(texts(".tile .value")) == ["91.5 °C", "85 °C", "–"]
+        [hot, _, unread] = await tab.value(texts(".tile"))
+        assert "▲ 80" in hot
+        assert "Oven too hot: too high (80)" in hot
+        assert "bad: starting" in unread
+        assert await tab.value('document.querySelectorAll(".tile.in-alarm.active").length') == 1
+        assert EVIL in unread  # as text
+        assert await tab.value('document.querySelector("#tiles img")') is None
+        assert "hall" in await tab.value(text("#lines-short"))
+        assert "oven is silent" in await tab.value(text("#wrong"))
+        # Nobody can write without a file of tokens.
+        assert await tab.value(
+            '[...document.querySelectorAll("button")].every((one) => one.hidden'
+            " || !/write|acknowledge/i.test(one.textContent) || !one.offsetParent)"
+        )
+
+
+async def test_one_search_finds_tags_and_devices(tab: Tab) -> None:
+    async with serving(plant=mixer()) as client:
+        await opened(tab, client)
+        await tab.press("/")
+        assert await tab.value("document.activeElement.id") == "find"
+        await tab.type("guard mixer")  # words of the description and of the key
+        await tab.until(f"{texts('#space .name')}.length === 1")
+        assert "mixer/alarms/door" in await tab.value(text("#space .name"))
+        await tab.value('document.getElementById("find").select()')
+        await tab.type("ov")
+        await tab.until(f"{text('#tags-title')}.startsWith('1 tag with')")
+        assert (await tab.value(texts("#found-devices li")))[0].startswith("oven on hall silent")
+        await tab.click("#found-devices a")
+        await tab.until(f"{text('#tags-title')} === '1 tag of oven'")
+        assert "check power" in await tab.value(text("#found-devices"))
+        await tab.value('document.getElementById("find").focus()')
+        await tab.press("Escape")
+        await tab.until(f"{text('#tags-title')} === '4 tags'")
+
+
+async def test_an_alarm_is_acknowledged_and_a_value_written_after_one_sign_in(
+    tab: Tab, tokens: Path
+) -> None:
+    async with serving(plant=oven(), tokens_file=tokens) as client:
+        client.north.orders = client.plant.parts.alarms.order
+        client.north.endings[b"90"] = WriteResult(90, 0, 0.03, verified=True)
+        await opened(tab, client, "alarms")
+        await tab.click('#alarms-list button[aria-label="acknowledge oven/temperature"]')
+        await sign_in(tab)
+        await tab.until(f"{text('#alarms-list')}.includes('acknowledged by Ana')")
+        assert client.north.written[0][2] == "web alice"
+        await tab.value('location.hash = "#tags"')
+        await tab.click('#space button[aria-label="write oven/setpoint"]')
+        await tab.until('document.activeElement.closest(".editor")')  # no token is asked for again
+        shown = await tab.value(text(".editor"))
+        assert "now 85 °C" in shown
+        assert "at least 20 °C, at most 250 °C" in shown
+        await tab.type("90")
+        await tab.press("Enter")
+        await tab.until(f"{text('.editor button.main')} === 'Confirm: 90 °C'")
+        assert len(client.north.written) == 1  # not yet
+        await tab.press("Enter")
+        await tab.until(f"{text('.editor .result')} === '90 °C: acknowledged and read back'")
+        assert client.north.written[1] == ("oven/setpoint", b"90", "web alice")
+        await tab.value('document.querySelector(".editor input").value = "251"')
+        for _ in range(2):
+            await tab.click(".editor button.main")
+        await tab.until(f"{text('.editor .result')}.startsWith('Not done: unknown-tag')")
+        kept = "Object.keys(localStorage).length + document.cookie.length"
+        assert await tab.value(kept) == 0  # the token is in the storage of this tab only
+
+
+async def test_a_wrong_token_is_said_and_not_kept(tab: Tab, tokens: Path) -> None:
+    async with serving(plant=oven(), tokens_file=tokens) as client:
+        await opened(tab, client)
+        await tab.click("#account")
+        await tab.value('document.getElementById("token").value = "wrong-wrong-wrong-wrong"')
+        await tab.value('document.getElementById("by").value = "Ana"')
+        await tab.value('document.getElementById("token-form").requestSubmit()')
+        await tab.until(f"{text('#sign-in-why')}.includes('does not know this token')")
+        assert await tab.value('sessionStorage.getItem("token")') is None
+        await sign_in(tab)
+        await tab.until(f"{text('#account')} === 'alice: sign out'")
+
+
+async def test_a_page_for_other_machines_asks_for_the_token(tab: Tab, tokens: Path) -> None:
+    async with serving(plant=oven(), host="0.0.0.0", tokens_file=tokens) as client:
+        await tab.open(f"http://127.0.0.1:{client.port}/")
+        await sign_in(tab)
+        await tab.until(f"{LIVE} && {texts('.tile .value')}[0] === '91.5 °C'")
+
+
+async def test_nothing_is_live_without_the_gateway_and_all_is_when_it_is_back(tab: Tab) -> None:
+    port, plant = free_port(), oven()
+    async with serving(plant=plant, port=port) as client:
+        await opened(tab, client)
+        await tab.until(f"{texts('.tile .value')}[0] === '91.5 °C'")
+    await tab.until('document.body.className === "stale"')
+    assert await tab.value(texts(".tile .quality")) == ["not live"] * 3
+    assert "may be old" in await tab.value(text("#lost"))
+    struck = 'getComputedStyle(document.querySelector(".tile .value")).textDecorationLine'
+    assert await tab.value(struck) == "line-through"
+    plant.now("oven/temperature", 12.0)
+    async with serving(plant=plant, port=port):
+        await tab.until(f"{LIVE} && {texts('.tile .value')}[0] === '12.0 °C'")
+        assert await tab.value('document.getElementById("lost").hidden')
+
+
+async def test_a_trend_has_a_cursor_a_zoom_and_bands_of_bad_quality(
+    tab: Tab, tmp_path: Path
+) -> None:
+    now = time.time_ns()
+    plant = PlainPlant(PlainDevice(SPEED.device, (SPEED,)))
+    with history(tmp_path / "history.db") as historian:
+        at = [now - second * SECOND for second in range(600, 0, -1)]
+        historian.record(
+            [
+                bad(SPEED, Reason.NO_REPLY, when)
+                if 200 <= place < 300
+                else good(SPEED, place, when)
+                for place, when in enumerate(at)
+            ]
+        )
+        plant.now(SPEED.key, 600)
+        async with serving(history=historian, plant=plant) as client:
+            await opened(tab, client, f"trend?tags={SPEED.key}&span=600")
+            await tab.until("!!document.querySelector('#chart .u-over')")
+            span = "(([, a, b]) => b - a)(location.hash.match(/from=([\\d.]+)&to=([\\d.]+)/) ?? [])"
+            assert await tab.value(f"isNaN({span})")
+            await tab.drag("#chart .u-over", 0.4, 0.45)  # where nothing was known
+            await tab.until(f"{span} > 20 && {span} < 40")
+            await tab.until(f"{text('#pens .at')}.includes('no value: no-reply')")
+            await tab.click("#wider")
+            await tab.until(f"{span} > 40 && {span} < 80")
+            await tab.click('#spans button[value="300"]')
+            await tab.until("location.hash.endsWith('&span=300')")
+            await tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=5, y=5)
+            await tab.until(
+                "document.querySelector('#spans [aria-pressed=true]').textContent === '5 min' && "
+                "document.getElementById('trend-text').textContent.includes('(now)')"
+            )
+            assert await tab.value(text("#pens .value")) == "600"
+
+
+async def test_fifty_thousand_tags_scroll_in_a_few_rows(tab: Tab) -> None:
+    devices = [
+        PlainDevice(f"d{number}", tuple(tag(f"d{number}", f"t{one}") for one in range(500)))
+        for number in range(100)
+    ]
+    async with serving(plant=PlainPlant(*devices)) as client:
+        await opened(tab, client, "tags")
+        await tab.until(f"{text('#tags-title')} === '50,000 tags'")
+        names = texts("#space .name")
+        await tab.until(f"{names}[0] === 'd0/t0'")
+        for place, name in (("1e9", "d99/t499"), ("0", "d0/t0"), ("25000 * 60", "d5")):
+            await tab.value(f'document.getElementById("window").scrollTop = {place}')
+            await tab.until(f"{names}.some((one) => one.startsWith('{name}'))")
+            assert await tab.value('document.querySelectorAll("#space .row").length') < 60
+        await tab.value('document.getElementById("find").focus()')
+        await tab.type("d42/t4")
+        await tab.until(f"{text('#tags-title')}.startsWith('111 tags')")
+        await tab.until(f"{names}[0] === 'd42/t4'")
+
+
+OUTSIDE = """
+[...document.querySelectorAll("main *, header *, nav *")].filter((one) => one.checkVisibility()
+  && !one.closest(".hidden, svg, .uplot, .skip")
+  && one.getBoundingClientRect().right > innerWidth + 1)
+  .map((one) => one.outerHTML.slice(0, 200))
+"""
+CUT = """
+[...document.querySelectorAll(".value, .name, .tile, .alarm, nav a, .count")].filter((one) =>
+  one.checkVisibility() && one.scrollWidth > one.clientWidth + 1
+  && getComputedStyle(one).display !== "inline")
+  .map((one) => one.outerHTML.slice(0, 200))
+"""
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1920, 1080)])
+async def test_nothing_is_cut_off(tab: Tab, tokens: Path, width: int, height: int) -> None:
+    plant = oven()
+    async with serving(plant=plant, tokens_file=tokens) as client:
+        await tab.look(width, height, dark=width < 600)
+        for view in ("overview", "tags", "alarms", "lines", "trend?tags=oven/temperature"):
+            await opened(tab, client, view)
+            await tab.until(
+                "document.querySelectorAll('.view:not([hidden]) li, .row b').length > 0"
+            )
+            assert await tab.value("document.documentElement.scrollWidth") <= width
+            assert (view, await tab.value(OUTSIDE)) == (view, [])
+            assert (view, await tab.value(CUT)) == (view, [])
