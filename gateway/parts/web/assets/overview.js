@@ -45,6 +45,7 @@ function showTiles(keys) {
   shown = keys;
   keyed(byId("tiles"), keys, (key) => key, makeTile, showTile);
   fill();
+  showAll();
   if (!keys.length) byId("tiles").replaceChildren(h("li", { className: "soft" }, "No tag is chosen."));
   byId("chosen").replaceChildren(
     ...(pinned ? ["Chosen on this page. ", h("button", { type: "button", className: "link", onclick: unpin }, "Show the choice of the file")] : []),
