@@ -216,7 +216,6 @@ def _state(documents: Documents) -> dict[str, Any]:
     return {
         **{name: known["status"][name] for name in ("name", "version", "up", "tags", "simulated")},
         "links": known["zenoh"]["to"],
-        "writes": known["outcomes"]["counts"],
         "history": known.get("history", {}).get("state"),
         "standby": known.get("standby", {}).get("stand"),
         **{name: known[name][:MOST_SENTENCES] for name in ("faults", "warnings")},
