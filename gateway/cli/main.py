@@ -35,6 +35,7 @@ _COMMANDS = {
     "simulate": "line.simulate:simulate",
     "status": "status:status",
     "health": "status:health",
+    "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",
     "audit": "audit:audit",
     "trace": "trace:trace",

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = str(ROOT / "config.example.yaml")
 COMMANDS = [
     *("run", "check", "read", "write", "control", "watch", "scan", "simulate"),
-    *("status", "health", "schema", "version"),
+    *("status", "health", "doctor", "schema", "version"),
 ]
 
 
