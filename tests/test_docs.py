@@ -45,7 +45,7 @@ from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from gateway.tags.tag import READ
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import free_endpoint, free_port
 
 README = ROOT / "README.md"
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -102,7 +102,8 @@ def prose(page: str) -> str:
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Starts the example gateway on a free port, with `blocks: true`; yields its file."""
     text = EXAMPLE.read_text("utf-8")
-    for old, new in ((ENDPOINT, free_endpoint()), ("# blocks: true ", "blocks: true ")):
+    page = ("127.0.0.1:8080", f"127.0.0.1:{free_port()}")
+    for old, new in ((ENDPOINT, free_endpoint()), page, ("# blocks: true ", "blocks: true ")):
         assert text.count(old) == 1
         text = text.replace(old, new)
     path = tmp_path_factory.mktemp("docs") / "config.yaml"

@@ -21,6 +21,7 @@ from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, err
 from gateway.config import Config, load
 from gateway.errors import ConfigError, GatewayError
+from gateway.parts.web.settings import WebSection
 from gateway.service import service
 from gateway.tags import Tag, WriteRule
 from gateway.transport.loop import new_event_loop
@@ -88,10 +89,13 @@ def program() -> str:
 
 
 def next_steps(config: Config, path: Path, command: str) -> str:
-    """Returns the commands to try in a second terminal; `command` starts this program."""
+    """Returns the address of the page, and the commands to try in a second terminal; `command`
+    starts this program."""
     file = shlex.quote(str(path))
     tags = [tag for device in config.devices for tag in device.tags]
+    web = config.part(WebSection)
     lines = [
+        *([] if web is None else [f"Page: {web.url}"]),
         f"Gateway {config.name}: {size(config)}. In a second terminal:",
         f"  {command} watch {file}",
     ]

@@ -49,3 +49,9 @@ def test_an_address_for_other_machines_without_tokens_is_refused(tmp_path: Path)
 def test_a_short_token_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="20 to 200 characters"):
         warned(tmp_path, "short", listen="127.0.0.1:8080", tokens_file="tokens.txt")
+
+
+def test_an_overview_of_an_unknown_tag_is_refused(tmp_path: Path) -> None:
+    assert warned(tmp_path, overview=["mixer/speed", "mixer/*"]) == []
+    with pytest.raises(ConfigErrors, match="there is no tag oven/\\*"):
+        warned(tmp_path, overview=["mixer/speed", "oven/*"])

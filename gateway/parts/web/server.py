@@ -112,18 +112,13 @@ class Server:
         try:
             server = await self._bound(runner)
             try:
-                log.info("web page ready", at=self._address)
+                log.info("web page ready", at=self._config.url)
                 await asyncio.Event().wait()
             finally:
                 server.close()
         finally:
             loads.cancel()
             await runner.cleanup()
-
-    @property
-    def _address(self) -> str:
-        host = f"[{self._config.host}]" if ":" in self._config.host else self._config.host
-        return f"http://{host}:{self._config.port}/"
 
     async def _bound(self, runner: web.AppRunner) -> asyncio.AbstractServer:
         handlers = runner.server
@@ -141,7 +136,7 @@ class Server:
                 )
             except OSError as error:
                 if (why := error.strerror or str(error)) != logged:
-                    log.error("web page not served", at=self._address, why=why)  # noqa: TRY400
+                    log.error("web page not served", at=self._config.url, why=why)  # noqa: TRY400
                 logged = why
                 await asyncio.sleep(AGAIN)
                 continue

@@ -31,6 +31,11 @@ class WebSection(Section):
         return self.listen[1]
 
     @property
+    def url(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}/"
+
+    @property
     def is_local(self) -> bool:
         """True if other machines cannot reach the address."""
         try:
