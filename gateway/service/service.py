@@ -25,7 +25,7 @@ from gateway.plant.threads import off_loop
 from gateway.service.bulkheads import Bulkheads
 from gateway.service.reload import LiveReload, Reloader, RunningLines
 from gateway.service.supervisor import Supervisor
-from gateway.transport.listen_port import close_doors
+from gateway.transport.device_servers import close_doors
 
 log = structlog.get_logger("gateway")
 # Seconds. Python's usual 5 ms of the publishing thread would delay the lines.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _OPENERS = {
     SerialPath: "serial_port",
     TcpAddress: "tcp",
-    ListenAddress: "listen_port",
+    ListenAddress: "device_servers",
     Rfc2217Address: "rfc2217",
     ModemAddress: "modem",
 }
@@ -63,7 +63,7 @@ async def open_port(
 
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
         case ListenAddress():
-            from gateway.transport.listen_port import open_listen
+            from gateway.transport.device_servers import open_listen
 
             return await open_listen(where, receiver, timeout=timeout, baudrate=settings.baudrate)
         case ModemAddress():

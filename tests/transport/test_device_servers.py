@@ -9,11 +9,11 @@ import pytest
 
 from gateway.errors import LineDown
 from gateway.transport import Port, SerialSettings, open_port
-from gateway.transport.listen_port import MOST_UNREGISTERED, close_doors
+from gateway.transport.device_servers import MOST_UNREGISTERED, close_doors
 from gateway.transport.port import DeviceServer, ListenAddress, parse_port
 from tests.transport.ends import PATIENCE, RecordingReceiver, free_port, listening
 
-MODULE = "gateway.transport.listen_port"
+MODULE = "gateway.transport.device_servers"
 ONE, OTHER = DeviceServer(b"DTU-1", b"ping"), DeviceServer(b"DTU-2")
 ANY = SerialSettings()
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
