@@ -7,6 +7,7 @@ in `detail`. A value with a name has it in `text`. One that is no plain reading 
 beyond 2**53 a reader in JavaScript must parse them itself.
 """
 
+import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -213,7 +214,10 @@ def word(result: WriteResult | CommandResult | Failure) -> OutcomeWord:
 
 def document(found: object) -> bytes:
     """A status document; values of types that JSON lacks are written as text."""
-    return orjson.dumps(found, default=str, option=orjson.OPT_NON_STR_KEYS)
+    try:
+        return orjson.dumps(found, default=str, option=orjson.OPT_NON_STR_KEYS)
+    except TypeError:  # the name of a file can have bytes that are no text
+        return json.dumps(found, default=str, ensure_ascii=False).encode(errors="replace")
 
 
 def sample_fields(sample: Sample) -> ValueDocument:
