@@ -8,10 +8,12 @@ from typing import Any
 from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 
-from gateway.contract.documents.catalogue import FILE, KINDS, RAW, SUBSCRIBE
+from gateway.contract.documents.catalogue import FILE, KINDS, PLACE, RAW, REASONS, SUBSCRIBE
 from gateway.contract.keys import CONTRACT
 
-ASYNCAPI = Path(__file__).parents[1] / "docs" / "asyncapi.json"
+ROOT = Path(__file__).parents[1]
+ASYNCAPI = ROOT / "docs" / "asyncapi.json"
+OF_BRIDGES = ROOT / "examples" / "bridges" / "reasons.json"
 
 
 class _Plain(GenerateJsonSchema):
@@ -40,6 +42,10 @@ def schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "What a PLC gateway puts on Zenoh",
         "contract": CONTRACT,
+        "reasons": {
+            reason.value: {"opcua": code, "ne107": signal}
+            for reason, (code, signal) in REASONS.items()
+        },
         "documents": documents,
         **shared,
     }
@@ -52,8 +58,8 @@ def asyncapi(found: dict[str, Any]) -> dict[str, Any]:
     inside = json.dumps(found).replace("#/$defs/", "#/components/schemas/")
     found = json.loads(inside)
     for name, document in found["documents"].items():
-        if name == RAW:
-            continue  # no payload of JSON
+        if name in (RAW, PLACE):
+            continue  # no payload
         channel = name.replace(": ", "_").replace(" ", "_")
         places = re.findall(r"{(\w+)}", document["key"])
         messages = {"reply": {"contentType": "application/json", "payload": document["schema"]}}
@@ -93,6 +99,7 @@ def text(document: dict[str, Any]) -> str:
 def main() -> None:
     found = schema()
     FILE.write_text(text(found), "utf-8")
+    OF_BRIDGES.write_text(text(found["reasons"]), "utf-8")
     ASYNCAPI.write_text(text(asyncapi(found)), "utf-8")
 
 

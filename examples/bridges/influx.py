@@ -13,6 +13,7 @@ go to the standard output, for Telegraf's `inputs.execd`.
     plc,device=mixer,name=speed good=false,reason="no-reply" 1763640003500000000
     plc_bridge lost=120i,refused=0i 1763640010000000000
 
+* A value at an end of its clamp has `limited="low"` or `limited="high"`.
 * An array has a field for each element, `value_0`, `value_1` ...
 * Numbers and bits (0, 1) are in `value`, texts and the names of an `enum` in `text`. Beyond 2^53 a
   number is exact in `text` only.
@@ -59,6 +60,8 @@ def line_of(key: str, known: Known) -> str:
             fields += f",text={quoted(str(value))}"
         elif "text" in known:
             fields += f",text={quoted(str(known['text']))}"
+    if "limited" in known:
+        fields += f",limited={quoted(known['limited'])}"
     origin = f",origin={known['origin']}" if "origin" in known else ""
     nanoseconds = round(datetime.fromisoformat(known["time"]).timestamp() * 1_000_000) * 1000
     return f"plc,device={device},name={tag}{origin} {fields} {nanoseconds}"

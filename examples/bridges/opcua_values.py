@@ -3,6 +3,7 @@
 import json
 import struct
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import zenoh
 from asyncua import ua
@@ -13,18 +14,12 @@ from gateway_values import Known, Plant, copied
 
 Code, Type = ua.StatusCodes, ua.VariantType
 
-STATUS = {  # by the reason of a bad value
-    "starting": Code.BadWaitingForInitialData,
-    "no-gateway": Code.BadNoCommunication,
-    "no-reply": Code.BadDeviceFailure,
-    "garbled": Code.BadCommunicationError,
-    "line-down": Code.BadNotConnected,
-    "refused": Code.BadConfigurationError,
-    "overdue": Code.BadResourceUnavailable,
-    "disabled": Code.BadOutOfService,
-    "not-a-number": Code.BadSensorFailure,
-    "wrong-device": Code.BadConfigurationError,
-}
+# By the reason of a bad value; reasons.json is a part of what `@describe` of a gateway answers.
+STATUS = {
+    reason: getattr(Code, codes["opcua"])
+    for reason, codes in json.loads((Path(__file__).parent / "reasons.json").read_text()).items()
+} | {"no-gateway": Code.BadNoCommunication}
+LIMITED = {"low": 0x0500, "high": 0x0600}  # limit bits of a status code, of a data value
 TYPES = {  # by the type of a tag; the others are texts
     "bool": Type.Boolean,
     "int8": Type.SByte,
@@ -57,6 +52,7 @@ def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
     elif (variant := variant_of(known["value"], kind)) is not None:
         if known.get("origin") == "simulated":  # no plain reading of a device: not simply Good
             code = Code.GoodEdited
+        code |= LIMITED.get(known.get("limited", ""), 0)
         return ua.DataValue(variant, ua.StatusCode(code), time, now)
     else:
         code = Code.BadTypeMismatch

@@ -10,25 +10,13 @@ from rich.text import Text
 from gateway.cli.client import Row
 from gateway.cli.terminal import out, printable
 from gateway.tags import Quality, Sample, Tag
-from gateway.tags.timestamps import rfc3339
 
 
 def row_of(sample: Sample) -> Row:
     """Returns the row of a sample, with the payload that Zenoh would carry."""
-    document: dict[str, object] = {
-        "value": sample.value,
-        "quality": sample.quality.value,
-        "time": rfc3339(sample.time),
-    }
-    if sample.tag.shaping.names is not None and (
-        text := sample.tag.shaping.names.text(sample.value)
-    ):
-        document["text"] = text
-    if sample.reason is not None:
-        document["reason"] = sample.reason.value
-    if (origin := sample.tag.origin.word) is not None:
-        document["origin"] = origin
-    return Row(sample.tag.key, document)
+    from gateway.contract.payload import sample_fields  # for a command that opens the port
+
+    return Row(sample.tag.key, {**sample_fields(sample)})
 
 
 def is_good(row: Row) -> bool:
@@ -54,8 +42,9 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) ->
     for row in rows:
         document = row.document
         good = is_good(row)
-        origin = document.get("origin")
-        quality = f"good, {origin}" if origin else "good"
+        end = document.get("limited")
+        told = ["good", document.get("origin"), f"limited {end}" if end else None]
+        quality = ", ".join(str(one) for one in told if one)
         quality = quality if good else f"bad: {document.get('reason')}"
         tag = tags.get(row.tag)
         table.add_row(

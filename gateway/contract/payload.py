@@ -3,8 +3,9 @@
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
 value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
 in `detail`. A value with a name has it in `text`. One that is no plain reading of a device has its
-`origin`: `simulated` or `computed`. Integers stay JSON integers whatever their size:
-beyond 2**53 a reader in JavaScript must parse them itself.
+`origin`: `simulated` or `computed`. One at an end of its clamp is `limited`: `low` or `high`.
+Integers stay JSON integers whatever their size: beyond 2**53 a reader in JavaScript must parse them
+itself.
 """
 
 import json
@@ -25,7 +26,12 @@ from gateway.contract.documents.requests import (
     OutcomeWord,
     WrittenDocument,
 )
-from gateway.contract.documents.values import KnownValue, UnknownValue, ValueDocument
+from gateway.contract.documents.values import (
+    KnownValue,
+    PlaceDocument,
+    UnknownValue,
+    ValueDocument,
+)
 from gateway.contract.problems import PROBLEMS, Failure, Problem
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.tags import Quality, Reason, Sample, WriteResult
@@ -114,12 +120,14 @@ def value(sample: Sample) -> bytes:
     if sample.quality is not _GOOD or not _has_json(known) or tag.shaping.names is not None:
         return orjson.dumps(sample_fields(sample))
     origin = None if tag.origin is READ else tag.origin.word
-    return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time, origin))
+    limited = None if tag.shaping.clamp is None else tag.shaping.limited(known)
+    return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time, origin, limited))
 
 
 @lru_cache(maxsize=256)  # the samples of one scan share one time
-def _end_of_good(time: int, origin: str | None) -> bytes:
+def _end_of_good(time: int, origin: str | None, limited: str | None) -> bytes:
     known = "" if origin is None else f',"origin":"{origin}"'
+    known += "" if limited is None else f',"limited":"{limited}"'
     return f',"quality":"good","time":"{rfc3339(time)}"{known}}}'.encode()
 
 
@@ -150,6 +158,12 @@ def attachment(sample: Sample) -> bytes:
 def block(samples: Iterable[Sample]) -> bytes:
     """`{tag: {value, quality, time}}` of one device."""
     return orjson.dumps({sample.tag.name: sample_fields(sample) for sample in samples})
+
+
+def place(epoch: str, number: int) -> bytes:
+    """The place of a block among those of its device: a consumer sees that it missed one."""
+    found: PlaceDocument = {"epoch": epoch, "seq": number}
+    return orjson.dumps(found)
 
 
 def outcome(result: Result) -> bytes:
@@ -235,6 +249,8 @@ def sample_fields(sample: Sample) -> ValueDocument:
             unknown["detail"] = short(sample.detail)
     if (origin := sample.tag.origin.word) is not None:
         fields["origin"] = origin
+    if fields["quality"] == "good" and (end := sample.tag.shaping.limited(value)) is not None:
+        fields["limited"] = end
     return fields
 
 

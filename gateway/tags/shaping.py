@@ -2,11 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from gateway.errors import BadValue
 from gateway.tags.scaling import Ends, Linear, linear
+from gateway.values import Value
 from gateway.values.numerals import Scalar
+
+Limited = Literal["low", "high"]
 
 
 class Bounds(NamedTuple):
@@ -64,6 +67,17 @@ class Shaping:
         if self.decimals is None and self.clamp is None:
             return self
         return replace(self, decimals=None, clamp=None)
+
+    def limited(self, value: Value | None) -> "Limited | None":
+        """Returns the end of the clamp that the value, or an element, is at; None: at no end."""
+        if self.clamp is None or isinstance(value, (str, bool)) or value is None:
+            return None
+        if isinstance(value, tuple):
+            return next(filter(None, map(self.limited, value)), None)
+        low, high = self.clamp
+        if low is not None and value <= low:
+            return "low"
+        return "high" if high is not None and value >= high else None
 
     def rounded(self, value: Scalar) -> Scalar:
         """Returns a value to write with as many decimals as a read shows."""

@@ -1,7 +1,9 @@
 """The status codes of examples/bridges are complete, and those of docs/integrate.md."""
 
+import json
 import re
 
+from gateway.contract.documents.catalogue import FILE
 from gateway.contract.problems import Problem
 from gateway.tags import Reason
 from tests.e2e.processes import ROOT
@@ -26,9 +28,14 @@ def on_the_page(heading: str) -> dict[str, str]:
 
 
 def test_every_reason_of_a_bad_value_has_the_code_of_the_page() -> None:
-    known = codes("opcua_values.py")
+    table = json.loads((BRIDGES / "reasons.json").read_text())
+    assert table == json.loads(FILE.read_text("utf-8"))["reasons"]
+    known = {reason: one["opcua"] for reason, one in table.items()}
+    known["no-gateway"] = "BadNoCommunication"
     assert known == on_the_page("| status code of the value |")
     assert set(known) == {*Reason, "no-gateway"}
+    signals = dict(re.findall(r"^\| `([\w-]+)`[^|]*\| \w+ \| (\w) \|$", PAGE, re.MULTILINE))
+    assert signals == {reason: one["ne107"] for reason, one in table.items()}
 
 
 def test_every_outcome_of_a_write_has_the_code_of_the_page() -> None:

@@ -19,13 +19,13 @@ from tests.history_writer import tag
 
 HOUR = "[2026-11-21T12:00:00Z..2026-11-21T12:00:40Z["
 EXPORTED = """\
-time,tag,value,quality,reason,origin
-2026-11-21T12:00:00.000000Z,mixer/speed,5.5,good,,
-2026-11-21T12:00:10.000000Z,mixer/speed,,bad,no-reply,
-2026-11-21T12:00:15.000000Z,mixer/name,"A, B",good,,
-2026-11-21T12:00:20.000000Z,mixer/speed,18446744073709551615,good,,
-2026-11-21T12:00:25.000000Z,mixer/name,,bad,no-reply,
-2026-11-21T12:00:25.000000Z,mixer/steps,"[1, 2.5]",good,,
+time,tag,value,quality,reason,origin,limited
+2026-11-21T12:00:00.000000Z,mixer/speed,5.5,good,,,
+2026-11-21T12:00:10.000000Z,mixer/speed,,bad,no-reply,,
+2026-11-21T12:00:15.000000Z,mixer/name,"A, B",good,,,
+2026-11-21T12:00:20.000000Z,mixer/speed,18446744073709551615,good,,,
+2026-11-21T12:00:25.000000Z,mixer/name,,bad,no-reply,,
+2026-11-21T12:00:25.000000Z,mixer/steps,"[1, 2.5]",good,,,
 """
 BUCKETS = """\
 time;tag;quality;mean;last;good;bad;known;reason;origin

@@ -241,7 +241,7 @@ async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
             ("plant/@gateway/demo/alarms/mixer/level", b"{}"),
         ]
         await client.get_until("plant/mixer/recipe", lambda one: one["quality"] == "good")
-        plant.plc.tell("set 1 D 20 900")
+        plant.plc.tell("set 1 D 20 1500")  # 150.0, beyond its clamp
         alarm = "plant/@gateway/demo/alarms/mixer/level"
         await client.get_until(alarm, lambda one: one["state"] == "active")
         answered = {kind.name for kind in KINDS if kind.verbs == (SEND,)}
@@ -301,7 +301,7 @@ def _read(reader: Reader, key: str, verb: str, replies: list[Reply]) -> None:
 
 
 def _subscribed(reader: Reader, sample: Received) -> None:
-    if sample.attachment:  # bare text
+    if sample.attachment:
         reader.read(sample.key, SUBSCRIBE, json.loads(sample.attachment))
-    elif sample.payload:
+    if sample.encoding == "application/json" and sample.payload:
         reader.read(sample.key, SUBSCRIBE, sample.json)

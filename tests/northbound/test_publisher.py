@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from functools import partial
 from typing import Any
 
 from gateway.contract.keys import Keys
@@ -21,7 +22,7 @@ from tests.northbound.plant import (
     mixer,
     tag,
 )
-from tests.zenoh_peer import TIMEOUT
+from tests.zenoh_peer import TIMEOUT, Received
 
 
 async def test_a_published_value_arrives_as_the_contract_says() -> None:
@@ -142,6 +143,27 @@ async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
         }
         [reply] = await client.get("plant/*/@block")
         assert set(reply.json) == {"speed", "recipe", "alarms/door"}
+
+
+async def test_blocks_are_counted_so_that_a_missing_one_is_seen() -> None:
+    plant = mixer(blocks=True)
+    epochs = []
+    for _ in range(2):
+        async with gateway_and_client(plant) as (northbound, client):
+            received = await client.subscribe("plant/mixer/@block")
+            for value in (1, 2, 3):
+                northbound.publish([plant.now("mixer/speed", value)])
+                await received.next(partial(holds, value))
+            places = [json.loads(block.attachment) for block in received.samples]
+            first = places[0]["seq"]
+            assert [place["seq"] for place in places] == [*range(first, first + len(places))]
+            [epoch] = {place["epoch"] for place in places}
+            epochs.append(epoch)
+    assert epochs[0] != epochs[1]
+
+
+def holds(value: int, block: Received) -> bool:
+    return bool(block.json.get("speed", {}).get("value") == value)
 
 
 async def test_with_blocks_only_no_single_value_is_put() -> None:

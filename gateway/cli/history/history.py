@@ -37,6 +37,7 @@ _SAMPLES = [
     Column("quality", "word"),
     Column("reason", "word"),
     Column("origin", "word"),
+    Column("limited", "word"),
 ]
 
 
@@ -143,12 +144,13 @@ def _samples(
 
 
 def _row(sample: Sample) -> tuple[Any, ...]:
-    origin = sample.tag.origin.word
+    tag, value = sample.tag, sample.value
     if has_value(sample):
-        return sample.time, sample.tag.key, sample.value, "good", None, origin
+        more = tag.origin.word, tag.shaping.limited(value)
+        return sample.time, tag.key, value, "good", None, *more
     reason = Reason.NOT_A_NUMBER if sample.quality is Quality.GOOD else sample.reason
     known = None if reason is None else reason.value
-    return sample.time, sample.tag.key, None, "bad", known, origin
+    return sample.time, tag.key, None, "bad", known, tag.origin.word, None
 
 
 def _buckets(

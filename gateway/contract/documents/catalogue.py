@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gateway.contract.documents import requests, state, values
+from gateway.tags import Reason
 
 FILE = Path(__file__).parent / "contract.json"
 SUBSCRIBE, GET, PAST, SEND = "subscribe", "get", "get with _time", "query with a payload"
 _SEEN = (SUBSCRIBE, GET)
-RAW = "raw value: attachment"
+RAW, PLACE = "raw value: attachment", "block: attachment"
 
 
 class Kind(NamedTuple):
@@ -28,6 +29,17 @@ class Kind(NamedTuple):
 
 _TAG = "{device}/{tag}"
 _OWN = "@gateway/{gateway}"
+REASONS = {  # of bad values: the status codes of OPC UA, and the status signals of NAMUR NE 107
+    Reason.STARTING: ("BadWaitingForInitialData", "C"),
+    Reason.NO_REPLY: ("BadDeviceFailure", "F"),
+    Reason.GARBLED: ("BadCommunicationError", "F"),
+    Reason.REFUSED: ("BadConfigurationError", "F"),
+    Reason.LINE_DOWN: ("BadNotConnected", "F"),
+    Reason.OVERDUE: ("BadResourceUnavailable", "F"),
+    Reason.DISABLED: ("BadOutOfService", "C"),
+    Reason.NOT_A_NUMBER: ("BadSensorFailure", "F"),
+    Reason.WRONG_DEVICE: ("BadConfigurationError", "F"),
+}
 _STATE: dict[str, Any] = {  # by path
     "status": state.StatusDocument,
     "lines/{line}": state.LineDocument,
@@ -53,6 +65,7 @@ KINDS = (
     Kind("past values: bucket", _TAG, (PAST,), values.BucketDocument),
     Kind("page", f"{_OWN}/page", (GET,), values.PageDocument),
     Kind("block", "{device}/@block", _SEEN, values.BlockDocument),
+    Kind(PLACE, "{device}/@block", (SUBSCRIBE,), values.PlaceDocument),
     Kind("meta", f"{_TAG}/@meta", (GET,), values.MetaDocument),
     Kind("write", f"{_TAG}/@set", (SEND,), requests.WrittenDocument, requests.WriteRequest),
     Kind("group", "{device}/@set", (SEND,), requests.GroupDocument, requests.GroupRequest),

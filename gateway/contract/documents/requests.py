@@ -7,6 +7,7 @@ from typing_extensions import TypedDict
 from gateway.contract.documents.values import Origin, Time, Why, words
 from gateway.contract.problems import Problem
 from gateway.tags import Level
+from gateway.tags.shaping import Limited
 from gateway.values import Value
 from gateway.values.numerals import Scalar
 
@@ -111,6 +112,7 @@ class AlarmDocument(TypedDict):
     reason: NotRequired[Why]
     detail: NotRequired[str]
     origin: NotRequired[Origin]
+    limited: NotRequired[Limited]
     value_at_change: Logged | None
     unit: str
     since: Time | None

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, NotRequired
 from typing_extensions import TypedDict
 
 from gateway.tags import Reason
+from gateway.tags.shaping import Limited
 from gateway.tags.tag import OriginWord
 from gateway.values import Value
 
@@ -39,6 +40,7 @@ class KnownValue(TypedDict):
     time: Time
     text: NotRequired[str]  # its name
     origin: NotRequired[Origin]
+    limited: NotRequired[Limited]  # at this end of its clamp: the device may be beyond
 
 
 class UnknownValue(TypedDict):
@@ -56,6 +58,14 @@ ValueDocument = KnownValue | UnknownValue
 BlockDocument = dict[str, ValueDocument]  # by tag
 
 
+class PlaceDocument(TypedDict):
+    """The attachment of a published block: `seq` counts its messages. `epoch` is another one after
+    each start of the gateway, and `seq` is 1 again."""
+
+    epoch: str
+    seq: int
+
+
 class WithoutValue(TypedDict):
     """The attachment of a value with `payload: raw`; `reason` if it is bad."""
 
@@ -65,6 +75,7 @@ class WithoutValue(TypedDict):
     detail: NotRequired[str]
     text: NotRequired[str]
     origin: NotRequired[Origin]
+    limited: NotRequired[Limited]
 
 
 _Ends = TypedDict("_Ends", {"from": list[float] | None, "to": list[float] | None})

@@ -46,9 +46,23 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
     )
 
 
-def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp | None) -> None:
+def put_json(
+    session: zenoh.Session,
+    key: str,
+    data: bytes,
+    stamp: zenoh.Timestamp | None,
+    attachment: bytes | None = None,
+) -> None:
     """Raises `ZError`."""
-    session.put(key, data, encoding=_JSON, congestion_control=_DROP, priority=_LOW, timestamp=stamp)
+    session.put(
+        key,
+        data,
+        encoding=_JSON,
+        congestion_control=_DROP,
+        priority=_LOW,
+        timestamp=stamp,
+        attachment=attachment,
+    )
 
 
 def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:

@@ -14,6 +14,7 @@ times as long, and for a moment after a link has returned puts on declared keys 
 import asyncio
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -66,6 +67,7 @@ class Publisher:
         self._serial = count()
         self._value_keys: dict[Tag, str] = {}  # cached: building one takes as long as queueing it
         self._waiting_events = 0
+        self._blocks = Counter[str]()  # sent since the start, by key
         self._closing = False
         self._filled = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -238,7 +240,9 @@ class Publisher:
         elif isinstance(data, bytes):
             encoding.put_json(session, key, data, stamp)
         elif isinstance(data, dict):
-            encoding.put_json(session, key, payload.block(data.values()), stamp)
+            self._blocks[key] += 1
+            place = payload.place(str(session.zid()), self._blocks[key])
+            encoding.put_json(session, key, payload.block(data.values()), stamp, place)
         elif isinstance(data, bool):
             self._set_token(session, key, declared=data)
             return

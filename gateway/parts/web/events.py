@@ -201,6 +201,8 @@ class Page:
             known = fields["value"]
             text = known if isinstance(known, str) else orjson.dumps(known).decode()
             why: str = fields.get("origin") or ""
+            if end := fields.get("limited"):
+                why = f"{why} limited {end}".strip()
             good = fields["quality"] != "bad"
             if fields["quality"] == "bad":
                 why = " ".join(filter(None, (fields["reason"], fields.get("detail"))))

@@ -71,6 +71,7 @@ _SAMPLE_MORE = {
     "reason": _TEXT_OR_NULL,
     "detail": TEXT,
     "origin": _ORIGIN,
+    "limited": _about(choice("low", "high"), "At this end of its clamp"),
 }
 
 SCHEMAS: Mapping[str, Schema] = {

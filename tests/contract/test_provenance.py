@@ -1,0 +1,161 @@
+"""What each way to a user shows of a value that is no plain reading: the table of the page."""
+
+import importlib
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.cli.history.history import _SAMPLES, _row  # a line of a CSV file, without the file
+from gateway.cli.tables import row_of, table_of
+from gateway.config import load
+from gateway.contract import payload
+from gateway.contract.documents.catalogue import REASONS
+from gateway.contract.meta import meta_fields
+from gateway.contract.past import buckets
+from gateway.contract.past.buckets import Bucket
+from gateway.tags import Reason, Tag, bad, good
+from tests.history.recorded import EVERYTHING, NOON, history
+
+ROOT = Path(__file__).parents[2]
+BRIDGES = ROOT / "examples" / "bridges"
+PAGE = (ROOT / "docs" / "contract.md").read_text("utf-8")
+FILE = """
+gateway: {name: demo}
+zenoh: {prefix: plant, listen: [tcp/127.0.0.1:0]}
+history: {path: history.db}
+defaults: {history: true}
+lines:
+  sim:
+    port: simulator
+    devices: {a: {protocol: vigor, station: 1, tags: {simulated: {address: D1}}}}
+  hall:
+    port: /dev/ttyS0
+    devices:
+      b:
+        protocol: vigor
+        station: 1
+        tags:
+          plain: {address: D1}
+          computed: {computed: plain * 2}
+          clamped: {address: D2, clamp: [0, 100]}
+          half: {address: D3, clamp: [null, 100]}
+          steps: {address: "D4", type: "int16[2]", clamp: [0, 100]}
+"""
+
+
+@pytest.fixture
+def tags(tmp_path: Path) -> dict[str, Tag]:
+    (tmp_path / "plant.yaml").write_text(FILE)
+    devices = load(tmp_path / "plant.yaml").devices
+    return {tag.name: tag for device in devices for tag in device.tags}
+
+
+@pytest.fixture
+def bridges(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+    """The modules of two bridges: a bridge runs without the package `gateway`."""
+    monkeypatch.syspath_prepend(BRIDGES)
+    before = set(sys.modules)
+    yield {name: importlib.import_module(name) for name in ("influx", "opcua_values")}
+    for path in BRIDGES.glob("*.py"):
+        if path.stem not in before:
+            sys.modules.pop(path.stem, None)
+
+
+def shown(tag: Tag, value: int, folder: Path, bridges: dict[str, Any]) -> dict[str, str]:
+    """What the ways show beside the value, as the page has it."""
+    sample = good(tag, value, NOON)
+    with history(folder / f"{tag.name}.db") as historian:
+        historian.record([sample])
+        [past] = historian.samples(tag, EVERYTHING, None)
+    known = json.loads(payload.value(sample))
+    bucket = Bucket(NOON, NOON, NOON + 1, 1, 1, 0, 1, 1, 1.0, 1, None)
+    table = table_of([row_of(sample)], {})
+    [quality] = table.columns[3].cells
+    names = [column.name for column in _SAMPLES]
+    return {
+        "value, block, JSON API": _about(known),
+        "past values": _about(json.loads(payload.value(past))),
+        "bare value: attachment": _about(json.loads(payload.attachment(sample))),
+        "bucket": _about(buckets.fields(tag, bucket, ["last"])),
+        "`@meta`": _about(meta_fields(tag)),
+        "`read`, `watch`": str(quality),
+        "CSV": _about(dict(zip(names, _row(past), strict=True))),
+        "OPC UA": _of_opcua(bridges["opcua_values"], tag, known),
+        "InfluxDB": ", ".join(
+            part.replace('"', "").replace("=", ": ")
+            for part in re.split("[ ,]", bridges["influx"].line_of(tag.key, known))
+            if part.startswith(("origin", "limited"))
+        ),
+    }
+
+
+def _of_opcua(opcua: Any, tag: Tag, known: dict[str, Any]) -> str:
+    code = opcua.data_value(known, opcua.type_of(meta_fields(tag))).StatusCode.value
+    names = {opcua.Code.Good: "Good", opcua.Code.GoodEdited: "GoodEdited"}
+    bits = {0: "", 0x500: ", limit bits low", 0x600: ", limit bits high"}
+    return names[code & 0xFFFF0000] + bits[code & 0xFFFF]
+
+
+def _about(document: dict[str, Any]) -> str:
+    return ", ".join(
+        f"{name}: {document[name]}" for name in ("origin", "limited") if document.get(name)
+    )
+
+
+def test_the_table_of_the_page_is_what_each_way_shows(
+    tags: dict[str, Tag], tmp_path: Path, bridges: dict[str, Any]
+) -> None:
+    cases = {"plain": 7, "simulated": 7, "computed": 7, "clamped": 100}
+    found = {name: shown(tags[name], value, tmp_path, bridges) for name, value in cases.items()}
+    rows = [
+        f"| {way} | {' | '.join(found[name][way] or '–' for name in cases)} |"
+        for way in found["plain"]
+    ]
+    table = (
+        PAGE.partition("## Where a value comes from")[2].partition("|---|")[2].partition("\n")[2]
+    )
+    assert table.partition("\n\n")[0].splitlines() == rows
+    marked = {way for way, text in found["simulated"].items() if text not in ("", "good", "Good")}
+    assert marked == set(found["simulated"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "limited"),
+    [
+        ("clamped", 0, "low"),
+        ("clamped", 1, None),
+        ("clamped", 99, None),
+        ("clamped", 100, "high"),
+        ("half", -32768, None),
+        ("half", 100, "high"),
+        ("steps", (1, 99), None),
+        ("steps", (5, 0), "low"),
+        ("plain", 0, None),
+    ],
+)
+def test_a_value_at_an_end_of_its_clamp_is_limited(
+    tags: dict[str, Tag], name: str, value: Any, limited: str | None
+) -> None:
+    assert json.loads(payload.value(good(tags[name], value, NOON))).get("limited") == limited
+
+
+def test_a_read_outside_of_the_clamp_is_limited(tags: dict[str, Tag]) -> None:
+    for word, value, limited in ((0xFFFF, 0, "low"), (50, 50, None), (300, 100, "high")):
+        known = tags["clamped"].decode([word])
+        assert known == value
+        assert tags["clamped"].shaping.limited(known) == limited
+
+
+def test_a_bad_value_is_not_limited(tags: dict[str, Tag]) -> None:
+    known = json.loads(payload.value(bad(tags["clamped"], Reason.NO_REPLY, NOON)))
+    assert "limited" not in known
+
+
+def test_every_reason_has_codes() -> None:
+    assert set(REASONS) == set(Reason)
+    assert {signal for _, signal in REASONS.values()} <= set("FCSM")
