@@ -41,7 +41,7 @@ _KNOWN = frozenset(
         "not",
     ]
 )
-_ANNOTATIONS = frozenset({"title", "description", "default", "examples"})
+_ANNOTATIONS = frozenset({"title", "description", "default", "examples", "format"})
 
 
 def violations(value: Any, schema: dict[str, Any]) -> list[str]:

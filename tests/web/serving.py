@@ -6,12 +6,12 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
+from gateway.contract.documents.state import DeviceDocument, Expected, StatusDocument, ZenohDocument
 from gateway.contract.faults import Documents
 from gateway.contract.interfaces import History
 from gateway.contract.payload import GroupResult
 from gateway.contract.problems import Failure, Problem
 from gateway.northbound.requests.audit import Counts
-from gateway.parts.web import metrics
 from gateway.parts.web.server import Server
 from gateway.parts.web.settings import WebSection
 from gateway.plant.part import Core
@@ -21,31 +21,41 @@ from tests.e2e.processes import free_port
 from tests.northbound.plant import PlainPlant, mixer
 
 TOKEN = "0123456789-0123456789"  # noqa: S105  (of these tests only)
-ZENOH = {"to": ["client"], "published": 7}
+ZENOH = {
+    **dict.fromkeys(ZenohDocument.__annotations__, 0),
+    "to": ["client"],
+    "connect": [],
+    "published": 7,
+}
 
 
 DOCUMENTS: Mapping[str, Mapping[str, Any]] = {
     "lines/hall": {
         "open": True,
         "trouble": "",
+        "last_trouble": "",
         "opened": 1,
+        "open_for": 5.0,
         "open_time": 5.0,
+        "baudrate": 19200,
         "busy_time": 1.0,
         "unasked_bytes": 0,
         "devices": {"mixer": "up", "oven": "silent"},
-        "expected": {"load": 0.3},
-        "measured": {"load": 0.2, "requests_per_second": 5.0},
+        "expected": {**dict.fromkeys(Expected.__annotations__, 0.0), "load": 0.3},
+        "measured": {"load": 0.2, "requests_per_second": 5.0, "slowest_write": 0.0},
+        "calls": None,
     },
     **{
         f"devices/{name}": {
+            **dict.fromkeys(DeviceDocument.__required_keys__, 1),
             "protocol": "vigor",
             "standing": standing,
+            "identity": None,
             "diagnosis": diagnosis,
             "failures": {"silence": 2},
             "refusals": {},
             "refused_addresses": [],
             "requests": [],
-            **dict.fromkeys([field for _, field, _ in metrics.DEVICE], 1),
         }
         for name, standing, diagnosis in (
             ("mixer", "up", ""),
@@ -95,18 +105,23 @@ class PlainNorth:
         self.orders: Callable[[str, bytes, str | None], Awaitable[bytes]] | None = None
 
     async def documents(self, max_age: float) -> Documents:
-        status = {
+        status: StatusDocument = {
+            "contract": 1,
             "name": "demo",
             "version": "1",
+            "time": "2026-11-20T12:00:00.000000Z",
             "up": 5.0,
             "tags": 4,
             "simulated": [],
+            "lines": {},
+            "devices": {},
             "refused_devices": {},
+            "refused_claims": [],
         }
         return {
             "status": status,
             "zenoh": ZENOH,
-            "alarms": {"normal": 3, "active": 1},
+            "alarms": {"normal": 3, "active": 1, "acknowledged": 0, "returned": 0},
             "outcomes": Counts().document(),
             **DOCUMENTS,
             **self.changed,

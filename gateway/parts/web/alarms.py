@@ -51,8 +51,8 @@ class AlarmApi:
                 "Acknowledges one alarm for an operator; a repeat gets the same answer",
                 method="post",
                 parameters=(_ALARM,),
-                body=ref("Acknowledgement"),
-                reply=ref("Alarm"),
+                body=ref("AcknowledgeRequest"),
+                reply=ref("AlarmDocument"),
                 done="It is acknowledged",
                 errors={
                     403: "No token",

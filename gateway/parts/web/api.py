@@ -123,7 +123,7 @@ class Api:
                 "/api/devices/{device}",
                 self._device,
                 "One device with its requests",
-                reply=ref("Device"),
+                reply=ref("DeviceDocument"),
                 errors={404: "No such device"},
             ),
             Route(
@@ -152,7 +152,7 @@ class Api:
                 method="post",
                 parameters=(_WRITTEN,),
                 body={"description": 'The value, as 12.5, true, [1, 2]; or {"value": 12.5}'},
-                reply={"anyOf": [ref("Written"), ref("WrittenGroup")]},
+                reply={"anyOf": [ref("WrittenDocument"), ref("GroupDocument")]},
                 done="The device acknowledged",
                 errors={408: "The body did not arrive", 415: "No application/json"},
                 failures={
