@@ -3,9 +3,12 @@
 import json
 import time
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
+import aiohttp
 import pytest
+from aiohttp import web
 
 from gateway.tags import AlarmRule, Level, Reason, WriteResult, WriteRule, bad, good
 from tests.conftest import needs
@@ -265,3 +268,47 @@ async def test_nothing_is_cut_off(tab: Tab, tokens: Path, width: int, height: in
             assert await tab.value("document.documentElement.scrollWidth") <= width
             assert (view, await tab.value(OUTSIDE)) == (view, [])
             assert (view, await tab.value(CUT)) == (view, [])
+
+
+async def test_the_page_works_behind_a_proxy_at_a_path_of_its_own(tab: Tab, tokens: Path) -> None:
+    async with serving(plant=oven(), tokens_file=tokens) as client, proxy(client, "/hall") as port:
+        client.north.orders = client.plant.parts.alarms.order
+        await tab.open(f"http://127.0.0.1:{port}/hall/#alarms")
+        await tab.until(LIVE)
+        await tab.click('#alarms-list button[aria-label="acknowledge oven/temperature"]')
+        await sign_in(tab)
+        await tab.until(f"{text('#alarms-list')}.includes('acknowledged by Ana')")
+        await tab.value('location.hash = "#trend?tags=oven/temperature"')
+        await tab.until("!!document.querySelector('#chart .u-over')")  # uplot.js was found
+
+
+@asynccontextmanager
+async def proxy(client: Client, path: str) -> AsyncIterator[int]:
+    """A reverse proxy that keeps the Host; yields its port."""
+    async with aiohttp.ClientSession(auto_decompress=False) as session:
+
+        async def passed(request: web.Request) -> web.StreamResponse:
+            url = f"http://127.0.0.1:{client.port}/{request.match_info['rest']}"
+            asked = session.request(
+                request.method,
+                url,
+                params=request.query,
+                headers=request.headers,
+                data=await request.read(),
+            )
+            async with asked as reply:
+                response = web.StreamResponse(status=reply.status, headers=reply.headers)
+                await response.prepare(request)
+                async for piece in reply.content.iter_any():
+                    await response.write(piece)
+            return response
+
+        app = web.Application()
+        app.router.add_route("*", f"{path}/{{rest:.*}}", passed)
+        runner = web.AppRunner(app, shutdown_timeout=0.1)
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, "127.0.0.1", port := free_port()).start()
+            yield port
+        finally:
+            await runner.cleanup()

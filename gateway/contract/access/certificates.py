@@ -18,18 +18,22 @@ DAY = 86_400
 _UTC_TIME, _VERSION = 0x17, 0xA0  # tags of ASN.1
 
 
-def check_files(tls: TlsConfig) -> None:
-    """Raises `ConfigError` for a file that is no certificate or no key, and for a key of another
-    certificate."""
+def check_files(tls: TlsConfig, section: str = "zenoh.tls") -> ssl.SSLContext:
+    """Returns the context of a server with these files.
+
+    Raises `ConfigError` for a file that is no certificate or no key, and for a key of another
+    certificate.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
         if file is not None:
-            with _as_config_error(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
+            with _as_config_error(f"{section}.{name} {file}", "holds no certificate in PEM form"):
                 context.load_verify_locations(file)
     if tls.certificate is not None and tls.key is not None:
         wrong = f"is no PEM key without a password, or not that of {tls.certificate}"
-        with _as_config_error(f"zenoh.tls.key {tls.key}", wrong):
+        with _as_config_error(f"{section}.key {tls.key}", wrong):
             context.load_cert_chain(tls.certificate, tls.key, password="")
+    return context
 
 
 def expiries(tls: TlsConfig) -> list[str]:

@@ -7,6 +7,7 @@ the client with the most connections: a client that opens thousands takes them f
 
 import asyncio
 import math
+import ssl
 from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
@@ -16,6 +17,7 @@ from typing import NamedTuple, cast
 from aiohttp import web
 
 MOST_CONNECTIONS = 256
+HANDSHAKE = 5.0  # seconds
 STALLED_AFTER = 1.0  # seconds without a piece taken
 
 
@@ -29,6 +31,10 @@ class Connections:
     def wrapped(self, protocol: asyncio.Protocol) -> asyncio.Protocol:
         """Returns the protocol of a new connection, which reports its begin and end."""
         return _Connection(self, protocol)
+
+    def secured(self, protocol: asyncio.Protocol, context: ssl.SSLContext) -> asyncio.Protocol:
+        """Returns the protocol of a new connection with TLS."""
+        return _Handshake(self, self.wrapped(protocol), context)
 
     def opened(self, transport: asyncio.Transport) -> None:
         if len(self._idle) + len(self._busy) >= MOST_CONNECTIONS:
@@ -91,6 +97,72 @@ def client_of(transport: asyncio.BaseTransport | None) -> str:
     """Returns the address of the client; empty if the connection was closed."""
     peer = transport.get_extra_info("peername") if transport is not None else None
     return str(peer[0]) if peer else ""
+
+
+class _Handshake(asyncio.Protocol):
+    """A connection until its handshake has ended. It counts as an idle one."""
+
+    def __init__(
+        self, connections: Connections, protocol: asyncio.Protocol, context: ssl.SSLContext
+    ) -> None:
+        self._connections = connections
+        self._protocol = protocol
+        self._context = context
+        self._early = b""  # a request that came with the end of the handshake
+        self._lost = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        plain = cast("asyncio.Transport", transport)
+        self._connections.opened(plain)
+        self._task = asyncio.get_running_loop().create_task(self._begin(plain))
+
+    def data_received(self, data: bytes) -> None:
+        self._early += data
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._lost = True
+
+    async def _begin(self, plain: asyncio.Transport) -> None:
+        try:
+            secure = await self._secure(plain)
+        except OSError:  # also of TLS
+            plain.abort()
+            return
+        finally:
+            self._connections.closed(plain)
+        if secure is None or self._lost:
+            return
+        secure.set_protocol(self._protocol)
+        self._protocol.connection_made(secure)
+        if self._early:
+            self._protocol.data_received(self._early)
+
+    async def _secure(self, plain: asyncio.Transport) -> asyncio.Transport | None:
+        """Raises `OSError`."""
+        if self._lost:
+            return None
+        loop = asyncio.get_running_loop()
+        starts = loop.create_task(
+            loop.start_tls(
+                plain, self, self._context, server_side=True, ssl_handshake_timeout=HANDSHAKE
+            )
+        )
+        while plain.get_protocol() is self and not starts.done():
+            await asyncio.sleep(0)
+        hello, self._early = self._early, b""
+        if hello and not starts.done():  # uvloop reads before a task can begin
+            handshake = cast("asyncio.BufferedProtocol", plain.get_protocol())
+            loop.call_soon(_feed, handshake, hello)
+        return await starts
+
+
+def _feed(protocol: asyncio.BufferedProtocol, data: bytes) -> None:
+    while data:
+        place = protocol.get_buffer(len(data))
+        size = min(len(place), len(data))  # type: ignore[arg-type]  # a memoryview
+        place[:size] = data[:size]  # type: ignore[index]
+        protocol.buffer_updated(size)
+        data = data[size:]
 
 
 class Who(NamedTuple):

@@ -35,7 +35,7 @@ def document(routes: Iterable[Route]) -> dict[str, Any]:
             "license": {"name": "Apache-2.0", "identifier": "Apache-2.0"},
             "description": _ABOUT,
         },
-        "servers": [{"url": "/"}],
+        "servers": [{"url": "."}],  # relative: a proxy may have another path
         "paths": paths,
         "components": {
             "schemas": SCHEMAS,

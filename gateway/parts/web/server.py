@@ -9,6 +9,8 @@ import gzip
 import json
 import logging
 import socket
+import ssl
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +18,9 @@ import structlog
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from gateway.parts.web import metrics, openapi
+from gateway.config import Config
+from gateway.errors import GatewayError
+from gateway.parts.web import exposure, metrics, openapi
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
@@ -27,11 +31,14 @@ from gateway.parts.web.settings import WebSection
 from gateway.parts.web.tag_list import TagList
 from gateway.plant.part import Core, Routed
 from gateway.plant.threads import off_loop
+from gateway.tags import Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 IDLE = 15.0  # seconds without a whole request until a connection is closed
 AGAIN = 10.0  # seconds until the address is tried again
+RENEWED = 3600.0  # seconds until the certificate is read again
+LOADED_WITHIN = 4.0  # seconds: a file system may hang
 SCRAPE_AGE = 1.0  # seconds that the state in the metrics may be old
 _FOLDER = Path(__file__).parent / "assets"
 _KINDS = {
@@ -69,6 +76,7 @@ class Server:
         self._api = Api(core, tags)
         self._loads = Loads(core)
         self._connections = Connections()
+        self._context: ssl.SSLContext | None = None
         guard = Guard(config, self._connections)
         events = Events(core, tags, self._loads, guard.who)
         routes = [
@@ -110,15 +118,32 @@ class Server:
         await runner.setup()
         loads = asyncio.create_task(self._loads.run(), name="loads")
         try:
+            await self._load_certificate()
             server = await self._bound(runner)
             try:
                 log.info("web page ready", at=self._config.url)
-                await asyncio.Event().wait()
+                while True:
+                    await asyncio.sleep(RENEWED)
+                    await self._renew()
             finally:
                 server.close()
         finally:
             loads.cancel()
             await runner.cleanup()
+
+    async def _load_certificate(self) -> None:
+        if (tls := self._config.tls) is not None:
+            self._context = await off_loop(exposure.context, tls, within=LOADED_WITHIN)
+
+    async def _renew(self) -> None:
+        try:
+            await self._load_certificate()
+        except GatewayError as error:
+            log.warning("certificate not renewed", why=str(error))
+
+    async def take_over(self, _config: Config, _renewed: Mapping[Tag, Tag]) -> None:
+        """A reload looks at the certificate at once."""
+        await self._renew()
 
     async def _bound(self, runner: web.AppRunner) -> asyncio.AbstractServer:
         handlers = runner.server
@@ -126,6 +151,8 @@ class Server:
             raise AssertionError("the runner is not set up")
 
         def connection() -> asyncio.Protocol:
+            if self._context is not None:
+                return self._connections.secured(handlers(), self._context)
             return self._connections.wrapped(handlers())
 
         logged = ""

@@ -3,10 +3,20 @@
 from fnmatch import fnmatchcase
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Any
 
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress
+
+
+class WebTlsSection(Section):
+    """HTTPS, with PEM files."""
+
+    certificate: FilePath
+    """The certificate of this machine, with those between it and its authority."""
+    key: FilePath
+    """The private key of the certificate; not readable by other users of this machine."""
 
 
 class WebSection(Section):
@@ -16,6 +26,8 @@ class WebSection(Section):
     """The address of the page."""
     tokens_file: FilePath | None = None
     """One line `name:token` for each client; without it nothing can be written."""
+    tls: WebTlsSection | None = None
+    """The page over HTTPS."""
     overview: list[Text] = []
     """Tags that the page shows first, in this order: keys, also with *; left out: those with an
     alarm, a history or a unit."""
@@ -33,7 +45,7 @@ class WebSection(Section):
     @property
     def url(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/"
+        return f"{'http' if self.tls is None else 'https'}://{host}:{self.port}/"
 
     @property
     def is_local(self) -> bool:
@@ -56,12 +68,21 @@ def _place(settings: WebSection | None, place: Place) -> WebSection | None:
     for number, pattern in enumerate(settings.overview):
         if not any(fnmatchcase(tag.key, pattern) for tag in place.tags):
             place.mistakes.add(("web", "overview", number), f"there is no tag {pattern}")
-    tokens = place.existing(settings.tokens_file, "web", "tokens_file")
-    return settings.model_copy(update={"tokens_file": tokens})
+    files: dict[str, Any] = {
+        "tokens_file": place.existing(settings.tokens_file, "web", "tokens_file")
+    }
+    if (tls := settings.tls) is not None:
+        found = {name: place.existing(file, "web", "tls", name) for name, file in dict(tls).items()}
+        files["tls"] = tls.model_copy(update=found)
+    return settings.model_copy(update=files)
 
 
 def _reads(settings: WebSection) -> list[tuple[str, Path | None]]:
-    return [("web.tokens_file", settings.tokens_file)]
+    tls = {} if settings.tls is None else dict(settings.tls)
+    return [
+        ("web.tokens_file", settings.tokens_file),
+        *((f"web.tls.{name}", file) for name, file in tls.items()),
+    ]
 
 
 SECTION = PartSection(name="web", settings=WebSection, place=_place, reads=_reads)
