@@ -60,3 +60,18 @@ async def test_questions_for_fresh_values_leave_a_fast_tag_its_time(tmp_path: Pa
             with pytest.raises(ConnectionError):
                 await asking
             assert beside > alone * 0.5, (beside, alone)
+
+
+async def test_a_key_that_takes_for_ever_to_match_is_refused(tmp_path: Path) -> None:
+    """Each `$*` more in one part of a key takes some twenty times as long, with all else held."""
+    endpoint, name = free_endpoint(), "a" * 60
+    device = {"protocol": "vigor", "station": 1, "tags": {name: {"address": "D1"}}}
+    lines = {"hall": {"port": "simulator", "devices": {"plc": device}}}
+    file = write_config(tmp_path / "c.yaml", endpoint, lines)
+    with await asyncio.to_thread(started, file):
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            for options in ("", "?max_age=0s", "?_time=[..]"):
+                [refused] = await client.get(f"plant/plc/{'$*a' * 12}$*b{options}")
+                assert refused.json["error"] == "bad-query"
+            [found] = await client.get("plant/plc/$*a$*")
+            assert found.key == f"plant/plc/{name}"

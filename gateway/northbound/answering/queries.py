@@ -38,6 +38,8 @@ StatusDocuments = Callable[[], Awaitable[dict[str, bytes]]]  # by full key
 FRESH_LIMIT = 256  # tags that one query may have read from the devices
 _BUSY = Failure(Problem.BUSY, "too many queries are waiting; nothing was done")
 _LONGEST_RANGE = 100  # characters
+_MOST_PARTS = 2  # `$*` in one part of a key: to match one more takes up to 60 times as long
+_TOO_WILD = Failure(Problem.BAD_QUERY, f"a part of the key has more than {_MOST_PARTS} times $*")
 _ENDING = Failure(Problem.UNCLEAR, "the gateway is ending")
 
 
@@ -91,7 +93,7 @@ class Queries:
         if self._is_foreign(parsed):
             pool.dismiss(query)
             return
-        if not pool.admit(query):
+        if not pool.admit(query) or self._is_too_wild(query, pool):
             return
         match parsed.family:
             case Family.SET | Family.COMMAND | Family.PEEK:
@@ -111,6 +113,13 @@ class Queries:
                 self._reads.answer_wide(query, partial(self._replies.current, parsed))
             case _:
                 self._reads.answer(query, partial(self._replies.current, parsed))
+
+    def _is_too_wild(self, query: zenoh.Query, pool: AnswerPool) -> bool:
+        """Refuses a key that would hold up everything while it is matched."""
+        if all(part.count("$*") <= _MOST_PARTS for part in str(query.key_expr).split("/")):
+            return False
+        pool.answer(query, partial(self._replies.outcome, _TOO_WILD))
+        return True
 
     def _pool(self, query: zenoh.Query, parsed: ParsedKey) -> AnswerPool:
         return self._requests if _is_request(query, parsed) else self._reads
