@@ -96,13 +96,15 @@ def warnings(documents: Documents) -> Iterator[str]:
         yield f"history: {lost} samples were lost since the start"
 
 
-def causes(line: str, documents: Documents) -> tuple[list[str], list[str]]:
-    """Returns faults and warnings of one line: a sentence for each cause."""
-    document = documents[f"lines/{line}"]
-    devices, unreachable = _devices_of(document, documents), _unreachable(documents)
-    wrong = () if stands_by(documents) else line_fault(line, document, devices)
-    told = device_warnings(line, [one for one in devices if one[0] not in unreachable])
-    return [*wrong], [*told]
+def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:
+    """Returns faults and warnings of each line: a sentence for each cause."""
+    unreachable, found = _unreachable(documents), {}
+    for line, document in below("lines/", documents):
+        devices = _devices_of(document, documents)
+        wrong = () if stands_by(documents) else line_fault(line, document, devices)
+        told = device_warnings(line, [one for one in devices if one[0] not in unreachable])
+        found[line] = [*wrong], [*told]
+    return found
 
 
 def _devices_of(line: Document, documents: Documents) -> list[tuple[str, Document]]:

@@ -24,6 +24,7 @@ from gateway.parts.web.routes import Route, Word, drop
 from gateway.parts.web.tag_list import TagList
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
+from gateway.plant.threads import off_loop
 from gateway.tags import Sample, Tag
 
 MOST_PAGES = 20  # and of one client
@@ -112,7 +113,7 @@ class Events:
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
-        tags = self._tags.chosen(_CHOSEN.of(request))
+        tags = await off_loop(self._tags.chosen, _CHOSEN.of(request))
         with (
             self._pages.taken(request.transport),
             self.wires.watched(_LINE.of(request) or "") as recorder,
@@ -213,7 +214,7 @@ class Page:
 
 
 def _state(documents: Documents) -> dict[str, Any]:
-    known = overview(documents)
+    known, why = overview(documents), causes(documents)
     line_of = {name: line for line, one in below("lines/", documents) for name in one["devices"]}
     return {
         **{name: known["status"][name] for name in ("name", "version", "up", "tags", "simulated")},
@@ -225,7 +226,7 @@ def _state(documents: Documents) -> dict[str, Any]:
         "lines": [
             [
                 *(name, one["open"], one["trouble"], one["expected"]["load"]),
-                *(one["measured"]["requests_per_second"], *causes(name, documents)),
+                *(one["measured"]["requests_per_second"], *why[name]),
             ]
             for name, one in below("lines/", documents)
         ],
