@@ -4,8 +4,13 @@
 last in the file). Others come back at random times, one after the other. It prints the time until
 the healthy station is read after the start and after a reset of the port, the time until a
 returned station is read, the share of the healthy station's polls that were done, and the longest
-write to it. Beside them are the limits that `check` prints. `--before` names a checkout of another
-version: both are then measured in turn.
+write to it. Beside them are the limits that `check` prints.
+
+With `--at-once` all 31 return at the same moment, on a line that is asked every 20 s. It prints
+when half and all of them are read, the time of all polls, and the longest of 100 writes to the
+healthy station while they were silent.
+
+`--before` names a checkout of another version: both are then measured in turn.
 """
 
 import argparse
@@ -23,7 +28,7 @@ from gateway.tags import WriteRule
 from tests.sim.plant import Plant, device, make_tag, plant, running, words
 from tests.sim.virtual import now, run_virtual
 
-STATIONS, EVERY, SETTLED = 32, 1.0, 120.0
+STATIONS, EVERY, SELDOM, SETTLED = 32, 1.0, 20.0, 120.0
 PRESENT = 30.0  # seconds for which a returned station stays
 
 
@@ -35,12 +40,12 @@ async def until(true: Callable[[], bool], most: float = 600.0) -> float:
     return now() - begun
 
 
-def silent_plant(baudrate: int, turnaround: float, seed: int) -> Plant:
+def silent_plant(baudrate: int, turnaround: float, seed: int, every: float = EVERY) -> Plant:
     wire = WireTiming(baudrate, 10)
     devices = []
     for station in range(1, STATIONS + 1):
-        tags = words(0, 20, every=EVERY, device=f"plc{station}")
-        tags.append(make_tag("D500", every=EVERY, device=f"plc{station}", write=WriteRule()))
+        tags = words(0, 20, every=every, device=f"plc{station}")
+        tags.append(make_tag("D500", every=every, device=f"plc{station}", write=WriteRule()))
         devices.append(device(tags, station=station, wire=wire))
     line = plant(devices, wire=wire, seed=seed)
     for each in line.stations:
@@ -90,17 +95,45 @@ async def measure(baudrate: int, turnaround: float, returns: int, seed: int) -> 
     ]
 
 
+async def at_once(baudrate: int, turnaround: float, seed: int) -> list[str]:
+    """Measures the return of all stations but one, which had replied before."""
+    chance, line = random.Random(seed), silent_plant(baudrate, turnaround, seed, SELDOM)
+    healthy, others, writes = line.devices[-1], line.devices[:-1], []
+    async with running(line):
+        for station in line.stations:
+            station.mute = False
+        await asyncio.sleep(SETTLED)
+        for station in line.stations[:-1]:
+            station.mute = True
+        await until(lambda: not any(other.health.online for other in others))
+        for _ in range(100):
+            await asyncio.sleep(chance.uniform(0.5, 3.0))
+            writes.append(line.submit(healthy, healthy.tags[-1], chance.randrange(1000)))
+        await asyncio.sleep(10.0)
+        for station in line.stations:
+            station.mute = False
+        half = await until(lambda: sum(map(line.good, others)) > len(others) // 2)
+        rest = await until(lambda: all(map(line.good, others)))
+    polls = sum(other.seconds(block.cost) for other in others for block in other.blocks)
+    slowest = max(write.at - write.asked for write in writes)
+    return [f"{half:.1f}", f"{half + rest:.1f}", f"{polls:.1f}", f"{slowest:.2f}"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--returns", type=int, default=100)
     parser.add_argument("--before", type=Path, help="a checkout of another version")
+    parser.add_argument("--at-once", action="store_true", help="all return at one moment")
     parser.add_argument("--once", action="store_true", help="print bare figures")
     chosen = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
     if chosen.once:
-        for baudrate in (9600, 19200):
+        for baudrate in (19200, 57600) if chosen.at_once else (9600, 19200):
             for turnaround in (0.0, 0.03):
-                figures = run_virtual(measure(baudrate, turnaround, chosen.returns, 1))
+                if chosen.at_once:
+                    figures = run_virtual(at_once(baudrate, turnaround, 1))
+                else:
+                    figures = run_virtual(measure(baudrate, turnaround, chosen.returns, 1))
                 print(baudrate, 1000 * turnaround, *figures)
         return
     from benchmarks.checkouts import run_in
@@ -108,11 +141,12 @@ def main() -> None:
     trees = {"now": Path(__file__).parent.parent}
     if chosen.before is not None:
         trees = {"before": chosen.before.resolve(), **trees}
-    print(
-        "| | baud | turnaround + ms | start | reset | seen, median | p99 | `check` | kept | write"
-    )
+    one = "start | reset | seen, median | p99 | `check` | kept | write"
+    title = "half | all | polls | write" if chosen.at_once else one
+    print(f"| | baud | turnaround + ms | {title}")
+    more = ["--at-once"] if chosen.at_once else []
     for name, tree in trees.items():
-        for row in run_in(tree, __file__, ["--returns", str(chosen.returns)]):
+        for row in run_in(tree, __file__, ["--returns", str(chosen.returns), *more]):
             print(f"| {name} | {' | '.join(row)} |")
 
 

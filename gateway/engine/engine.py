@@ -222,6 +222,12 @@ class Engine:
         self._set_deadline()
         return self._effects.take()
 
+    def probe_timeout(self, waiting: Device) -> float | None:
+        """Returns the seconds that a probe in flight may wait from now on, because a request to
+        another device waits; None: the job in flight goes on."""
+        job = self._in_flight.job
+        return job.brief if isinstance(job, Probe) and job.device is not waiting else None
+
     def submit_group(self, writes: Sequence[Write], now: float) -> list[Effect]:
         """Queues the writes of one group, or refuses them all."""
         if self.schedule.requests.has_room(len(writes)):

@@ -106,7 +106,7 @@ class Line:
         ends = [loop.create_future() for _ in writes]
         self._outcomes.update(zip(writes, ends, strict=True))
         self.deliver(self.engine.submit_group(writes, now))
-        self._wake.set()
+        self._hasten(device)
         return ends
 
     def command(
@@ -122,8 +122,15 @@ class Line:
     def _submit(self, request: Request) -> asyncio.Future[Any]:
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
         self.deliver(self.engine.submit(request, _now()))
-        self._wake.set()
+        self._hasten(request.device)
         return outcome
+
+    def _hasten(self, device: Device) -> None:
+        """Wakes the line for a request, and ends a patient probe of another device early."""
+        self._wake.set()
+        within = self.engine.probe_timeout(device)
+        if within is not None and self._transaction is not None:
+            self._transaction.hasten(within)
 
     def expedite(self, device: Device, tag: Tag) -> None:
         """Polls the tag's block before all other polls."""

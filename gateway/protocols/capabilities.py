@@ -112,7 +112,10 @@ class UnnumberedReplies(Protocol):
     def resync_shape(
         self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
     ) -> Hashable:
-        """Returns the shape of the reply to `resync`; None where no other reply can have it."""
+        """Returns the shape of the reply to `resync`; None where no other reply can have it.
+
+        For the token `PROOF`: None where no read has a shape of its own.
+        """
 
     def is_reply(self, frame: Any) -> bool:
         """Returns True for a reply of this station: for no request and no unsolicited frame."""

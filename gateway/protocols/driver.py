@@ -108,6 +108,7 @@ class Traits:
 
 
 EVERY_REQUEST = 0xFFFF  # `resync` returns it where its reply cannot be that to another request
+PROOF = -1  # the probe token of a resync whose reply has a shape of its own, if there is one
 
 F = TypeVar("F")
 T = TypeVar("T")

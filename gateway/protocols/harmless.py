@@ -4,13 +4,14 @@ A device may be silent about addresses that it lacks. So a resync reads inside t
 caller names, and each resync in another place and with another form of its reply.
 """
 
-from collections.abc import Awaitable, Callable, Hashable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.errors import Refused
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span
 
 MOST_UNITS, MOST_FORMS = 64, 6  # of one read; of the reads in one place
+PROOF_FORM = 9  # the form that resyncs do not use otherwise
 MOST_EARLIER = 16  # resyncs before this one
 # The form of the reply to a read, such as its number of bytes; None: it cannot be read.
 FormOf = Callable[[Span], Hashable | None]
@@ -46,6 +47,9 @@ async def resync_by_reads(
     An error reply names no request: it may be the late reply to the `outstanding` read. So one
     more read with another form follows it. Raises `Refused` where there is none.
     """
+    if token == PROOF:
+        await read(pick(PROOF))
+        return EVERY_REQUEST
     sent, other = pick(token), pick(token + 1)
     try:
         await read(sent)
@@ -87,6 +91,19 @@ class HarmlessReads:
             first = others[place]
         reads = first[turn % 2]
         return reads[(2 * step + second) % len(reads)]
+
+    def proof(self, used: Collection[Hashable] = ()) -> Span | None:
+        """Returns a read whose form no other resync has, nor those `used`; None: there is none."""
+        forms = {self.form(read) for place in self._places for reads in place for read in reads}
+        forms.update(used, () if self.outstanding is None else (self.form(self.outstanding),))
+        for area, start, size in self.spans:
+            found: set[Hashable] = set()
+            for units in range(1, min(size, MOST_UNITS) + 1):
+                read = Span(area, start, units)
+                found.add(form := self.form(read))
+                if len(found) >= PROOF_FORM and form is not None and form not in forms:
+                    return read
+        return None
 
     def _place(self, span: Span, late: Hashable) -> tuple[Sequence[Span], Sequence[Span]]:
         """Returns the reads at the begin of the span, and those at its end."""

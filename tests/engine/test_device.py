@@ -192,3 +192,24 @@ def test_half_of_the_use_of_the_wire_is_forgotten_every_ten_seconds() -> None:
     assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)
     dev.used(110.0, 110.0)
     assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)
+
+
+@pytest.mark.parametrize(
+    ("asked", "known", "proven"),
+    [
+        (Span("D", 0, 10), True, True),
+        (Span("D", 100, 9), True, False),  # the shape of the proof
+        (None, True, True),  # a resync
+        (None, False, False),  # a proof, or a request of any shape
+        (Span("D", 5, 1), False, False),  # a write
+    ],
+)
+def test_a_proof_needs_a_shape_that_no_unanswered_request_has(
+    asked: Span | None, known: bool, proven: bool
+) -> None:
+    dev = device(words(0, 20))
+    dev.health.unclear(NoReply("silence"), asked, 0.0, known=known)
+    dev.health.unclear(NoReply("silence"), Span("D", 0, 20), 1.0, known=True)
+    assert dev.may_be_proven is proven
+    dev.health.answered(resynced=True)
+    assert dev.may_be_proven

@@ -8,6 +8,7 @@ import pytest
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import Offline
 from gateway.planning.bad_addresses import SPLIT_FIRST
+from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Quality, Reason, WriteRule
 from tests.line.clocks import clocks, wind_up
 from tests.sim.plant import device, make_tag, plant, running
@@ -171,3 +172,39 @@ async def test_a_block_without_replies_is_read_in_parts_and_does_not_occupy_the_
         await asyncio.sleep(2 * SPLIT_FIRST)
         assert line.good(odd)
         assert sorted(block.span.size for block in odd.blocks) == [3, 40]
+
+
+@on_virtual_time
+async def test_31_stations_return_together_on_a_free_wire_within_3_seconds() -> None:
+    wire = WireTiming(57600, 10)
+    devices = [clocks(10, station=n, every=20.0, wire=wire) for n in range(1, 33)]
+    line = plant(devices, wire=wire)
+    wind_up(line)
+    async with running(line):
+        await asyncio.sleep(30)
+        for station in line.stations[1:]:
+            station.mute = True
+        await asyncio.sleep(300)  # more probes than can be told apart
+        assert not any(line.good(dev) for dev in devices[1:])
+        for station in line.stations[1:]:
+            station.mute = False
+        await asyncio.sleep(3)
+        assert all(line.good(dev) for dev in devices)
+
+
+@on_virtual_time
+async def test_a_write_does_not_wait_for_the_patient_probe_of_a_silent_station() -> None:
+    devices = [
+        device([make_tag("D0", write=WriteRule(), device=f"p{n}")], station=n) for n in (1, 2)
+    ]
+    line = plant(devices)
+    async with running(line):
+        await asyncio.sleep(5)
+        line.stations[1].mute = True
+        await asyncio.sleep(20)
+        took = []
+        for value in range(1500):
+            outcome = line.submit(devices[0], devices[0].tags[0], value)
+            await asyncio.sleep(0.2)
+            took.append(outcome.at - outcome.asked)
+        assert max(took) < 0.15

@@ -22,6 +22,33 @@ from tests.sim.plant import Outcome, Plant, made_device, make_tag, running
 from tests.sim.virtual import now, on_virtual_time
 
 
+@pytest.mark.parametrize("stall", [20.0, 90.0, 400.0])
+@pytest.mark.parametrize("sizes", [(20, 1), (9, 20), (18, 9, 3)])
+@pytest.mark.parametrize("driver", [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1)])
+@on_virtual_time
+async def test_a_link_that_kept_more_requests_than_can_be_told_apart(
+    driver: AnyDriver, sizes: tuple[int, ...], stall: float
+) -> None:
+    """The proof has a shape of its own, which a poll may have, too."""
+    area = "D" if driver.protocol == "vigor" else "holding:"
+    numbers = [1000 * n + i for n, size in enumerate(sizes) for i in range(size)]
+    tags = [make_tag(f"{area}{n}", driver, device="plc", type="uint16") for n in numbers]
+    server = DeviceServer()
+    line, dev, memory = behind(server, driver, *tags)
+    for number in numbers:
+        memory.write(area.strip(":"), number, [number])
+    async with running(line):
+        for phase in range(6):
+            await asyncio.sleep(20 + phase * 0.37)
+            assert dev.state is State.ONLINE
+            server.flows.clear()
+            await asyncio.sleep(stall)
+            server.flows.set()
+        await asyncio.sleep(20)
+        assert line.good(dev)
+    assert wrong_values(line) == []
+
+
 def wrong_values(line: Plant) -> list[object]:
     """The wrong good values, where each word holds its own number."""
     good = (sample for _, sample in line.reported if sample.quality is Quality.GOOD)

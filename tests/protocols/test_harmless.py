@@ -5,13 +5,17 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.protocols.driver import AnyDriver, Span
+from gateway.protocols.driver import EVERY_REQUEST, PROOF, AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from tests.doubles import Wire
 
-DRIVERS: list[AnyDriver] = [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1)]
+DRIVERS: list[ModbusRtu | ModbusAscii | Vigor] = [
+    ModbusRtu(station=1),
+    ModbusAscii(station=1),
+    Vigor(station=1),
+]
 
 
 def area_of(driver: AnyDriver) -> str:
@@ -51,6 +55,31 @@ async def test_a_resync_is_told_from_as_many_requests_as_it_says(
             resyncs -= 1
         assert length not in lengths[len(lengths) - resyncs :] or not resyncs
         lengths.append(length)
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from(DRIVERS),
+    st.lists(st.tuples(st.integers(0, 3000), st.integers(1, 30)), max_size=4),
+    st.none() | st.tuples(st.integers(0, 3000), st.integers(1, 30)),
+)
+async def test_a_proof_differs_from_every_resync_and_from_the_outstanding_request(
+    driver: ModbusRtu | ModbusAscii | Vigor,
+    places: list[tuple[int, int]],
+    late: tuple[int, int] | None,
+) -> None:
+    spans = [Span(area_of(driver), *place) for place in places]
+    outstanding = None if late is None else Span(area_of(driver), *late)
+    if driver.resync_shape(outstanding, PROOF, spans) is None:
+        assert all(size < 30 for _, size in places)
+        return
+    told, proof, _ = await resynced(driver, outstanding, PROOF, spans)
+    assert told == EVERY_REQUEST
+    cost = None if outstanding is None else driver.cost(outstanding)
+    assert cost is None or proof != cost.reply
+    for token in range(200):
+        _, length, _ = await resynced(driver, outstanding, token, spans)
+        assert length != proof
 
 
 @settings(max_examples=30)

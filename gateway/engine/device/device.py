@@ -18,7 +18,7 @@ from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.capabilities import Monitor, Windowed
-from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
+from gateway.protocols.driver import PROOF, AnyDriver, Cost, Span, Timing
 from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
 from gateway.tags import Tag
 
@@ -333,6 +333,15 @@ class Device:
         runs = runs_of([tag for tag in tags if tag not in bad] or tags)
         some = runs[:: 1 + len(runs) // MOST_PROBED]
         return some if self.last_read is None else (self.last_read, *some)
+
+    @property
+    def may_be_proven(self) -> bool:
+        """True if a resync with the token `PROOF` has a reply that no unanswered request has."""
+        shapes, asked = self.shapes, self.health.unanswered.spans
+        if shapes is None or None in asked:
+            return False
+        own = shapes.of_resync(self.health.outstanding, PROOF, self.probe_spans)
+        return own is not None and own not in {shapes.of(span) for span in asked if span}
 
     # Its share of the wire
 

@@ -67,6 +67,23 @@ TRANSITIONS: Mapping[tuple[State, Event], State] = {
 
 
 @dataclass(slots=True, eq=False)
+class Outstanding:
+    """The requests whose replies may still arrive."""
+
+    sent: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
+    # Their spans, but those of resyncs; None: a request that may have had any shape.
+    spans: set[Span | None] = field(default_factory=set)
+
+    def add(self, span: Span | None, now: float) -> None:
+        self.sent.append(now)
+        self.spans.add(span)
+
+    def clear(self) -> None:
+        self.sent.clear()
+        self.spans.clear()
+
+
+@dataclass(slots=True, eq=False)
 class Health:
     """The state of one device, and its outstanding requests.
 
@@ -85,7 +102,7 @@ class Health:
     trouble: GatewayError | None = None
     heard: Heard = Heard.NEVER
     probes: ProbePace = field(default_factory=ProbePace)
-    _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
+    unanswered: Outstanding = field(default_factory=Outstanding)
     _asked_at: float = -math.inf  # when a request ended unclear last, before it was offline
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
@@ -106,7 +123,7 @@ class Health:
         self.trouble = trouble
         self.consecutive_failures = 0
         self.probes.restart()
-        self.needs_resync = self.is_probed or (self.only_written and bool(self._unanswered))
+        self.needs_resync = self.is_probed or (self.only_written and bool(self.unanswered.sent))
 
     def reconnected(self) -> None:
         """Notes a new telephone call to an otherwise unchanged device."""
@@ -126,14 +143,21 @@ class Health:
         self.heard, self.trouble = Heard.REPLIED, None
         if not self._extra:
             self.needs_resync = False
-            self.outstanding = None
-            self._unanswered.clear()
+            self._clear()
         return came
 
-    def unclear(self, error: DeviceError, outstanding: Span | None, now: float) -> None:
+    def _clear(self) -> None:
+        """Notes that no reply to an older request may arrive any more."""
+        self.outstanding = None
+        self.unanswered.clear()
+
+    def unclear(
+        self, error: DeviceError, outstanding: Span | None, now: float, *, known: bool = False
+    ) -> None:
         """Notes a transaction without a reply, which may still arrive.
 
         `outstanding`: the requested span. None for a probe: an older span stays outstanding.
+        `known`: its reply has the shape of that span, or one of all resyncs.
         """
         if self.state is not State.OFFLINE:
             self._asked_at = now
@@ -143,7 +167,10 @@ class Health:
             self.probes.replied_damaged(now)
         if isinstance(error, Garbled) and error.evidence is Evidence.SHAPE:
             self.probes.replied_late(now)
-        self._unanswered.append(now)
+        if known and outstanding is None:
+            self.unanswered.sent.append(now)
+        else:
+            self.unanswered.add(outstanding if known else None, now)
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
         self.needs_resync = self.answerable
@@ -158,7 +185,7 @@ class Health:
     def left_outstanding(self, outstanding: Span | None, now: float) -> None:
         """Notes a request whose reply may still arrive, although nothing waits for it."""
         self.needs_resync = self.answerable
-        self._unanswered.append(now)
+        self.unanswered.add(outstanding, now)
         if outstanding is not None:
             self.outstanding = outstanding
 
@@ -170,8 +197,7 @@ class Health:
         self.probes.replied_late(now)
         if last and not self._extra:
             self.needs_resync = False
-            self.outstanding = None
-            self._unanswered.clear()
+            self._clear()
         self.trouble = Garbled(
             f"it took {took:.2f} s, reply_timeout is {reply_timeout:g} s", evidence=Evidence.SLOW
         )
@@ -185,7 +211,7 @@ class Health:
         self.heard = Heard.GAVE_UP
         self.probes.grow(now, spread)
         if self.only_written and now - self._asked_at >= FORGOTTEN:
-            self._unanswered.clear()
+            self.unanswered.clear()
             self.restart()
 
     def spoke(self, now: float, longest_reply: float) -> None:
@@ -215,7 +241,7 @@ class Health:
 
     def outstanding_requests(self, since: float) -> int:
         """Counts the requests sent after `since` that have no reply."""
-        return sum(sent > since for sent in self._unanswered)
+        return sum(sent > since for sent in self.unanswered.sent)
 
     @property
     def reason(self) -> Reason:

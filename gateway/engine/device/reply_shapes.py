@@ -115,7 +115,11 @@ class ReplyShapes:
         self, outstanding: Span | None, token: int, spans: Sequence[Span], now: float
     ) -> None:
         """Notes a resync that is sent alone."""
-        self.sent(self._driver.resync_shape(outstanding, token, spans), now)
+        self.sent(self.of_resync(outstanding, token, spans), now)
+
+    def of_resync(self, outstanding: Span | None, token: int, spans: Sequence[Span]) -> Hashable:
+        """Returns the shape of the reply to a resync, as the driver."""
+        return self._driver.resync_shape(outstanding, token, spans)
 
     def _sent(self, shape: Hashable, now: float) -> None:
         self._recent.append(shape)

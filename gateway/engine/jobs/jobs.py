@@ -31,6 +31,7 @@ class Probe:
     token: int
     again: bool = False  # the line has settled: any reply belongs to this probe
     timeout: float | None = None  # of a short probe; None: `reply_timeout` of the device
+    brief: float | None = None  # the time-out while a request to another device waits
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,11 +44,18 @@ class HealthRules:
             self._staleness.tick(now, time)
 
     def unclear(
-        self, device: Device, error: DeviceError, asked: Span | None, now: float, time: int
+        self,
+        device: Device,
+        error: DeviceError,
+        asked: Span | None,
+        now: float,
+        time: int,
+        *,
+        known: bool = False,
     ) -> State:
         """Applies an unclear transaction. Returns the state of the device before it."""
         before = device.health.state
-        device.health.unclear(error, asked, now)
+        device.health.unclear(error, asked, now, known=known)
         device.record.count_failure(error)
         device.monitor.forget()  # the device may have restarted
         name, why = device.name, str(error)

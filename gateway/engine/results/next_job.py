@@ -38,7 +38,7 @@ from gateway.errors import (
     Unclear,
     Unsteady,
 )
-from gateway.protocols.driver import EVERY_REQUEST
+from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
 
@@ -125,6 +125,10 @@ class NextJob:
                 outstanding = self._results.outstanding_requests(device)
                 inherited = told_from < EVERY_REQUEST and (self.inherits or device.health.inherits)
                 if not probe.again and (outstanding > told_from or inherited):
+                    if told_from and not inherited and device.may_be_proven:
+                        proof = Probe(device, probe.outstanding, PROOF, timeout=probe.timeout)
+                        self._in_flight.follow(proof)
+                        return
                     # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
                     guard = (outstanding + 1 + inherited) * quiet
@@ -166,7 +170,8 @@ class NextJob:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
-        before = self._results.unclear(device, error, span_of(job), now, time)
+        known = isinstance(job, Poll) or (isinstance(job, Probe) and job.token != PROOF)
+        before = self._results.unclear(device, error, span_of(job), now, time, known=known)
         no_guard = before is State.OFFLINE or _is_short(job) or _is_lost(job, error, now)
         settle = Settle(
             device,

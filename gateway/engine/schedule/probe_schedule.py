@@ -102,14 +102,17 @@ class ProbeSchedule:
     def probe(self, device: Device, now: float, *, patient: bool = False) -> Probe:
         """Returns a probe. It is short if the device is offline, or starts, or if noise destroys
         its replies: one that has not come by then does not come."""
-        health, timeout = device.health, None
+        health, timeout, brief = device.health, None, None
         starting = health.state is State.STARTING and not health.probes.short
         if health.probes.is_noisy(now) and health.probes.short < PATIENT_AFTER:
             timeout = brief_timeout(device)
         elif not patient and (starting or health.state is State.OFFLINE):
             timeout = short_timeout(device, self._devices)
+        elif health.state is State.OFFLINE and not health.probes.patient:
+            brief = short_timeout(device, self._devices)
         health.probes.sent(short=timeout is not None)
-        return Probe(device, health.outstanding, health.next_probe_token(), timeout=timeout)
+        token = health.next_probe_token()
+        return Probe(device, health.outstanding, token, timeout=timeout, brief=brief)
 
     def failed(self, now: float, took: float) -> None:
         """Notes an unclear transaction of `took` seconds with a device that is not offline."""

@@ -340,7 +340,10 @@ class Schedule:
             poll.reads.compare_with_nothing()
 
     def came_online(self, device: Device, now: float) -> None:
-        """Makes all blocks of a device due, because it came online."""
+        """Makes all blocks of a device due, because it came online. Others may be back, too."""
+        for other in self.devices:
+            if other.health.state is State.OFFLINE:
+                other.health.probes.soon()
         for poll in self._polls[device]:
             poll.came_online(now)
         self.plan(device, now)

@@ -40,7 +40,17 @@ from gateway.protocols.computer_link.scattered import (
     scattered_access,
 )
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import EVERY_REQUEST, Address, Area, Cost, Span, Talk, Timing, Traits
+from gateway.protocols.driver import (
+    EVERY_REQUEST,
+    PROOF,
+    Address,
+    Area,
+    Cost,
+    Span,
+    Talk,
+    Timing,
+    Traits,
+)
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.listening import Ear, Learn
 
@@ -311,7 +321,7 @@ class ComputerLink:
     ) -> Hashable:
         """None for a loopback: the letter Z and the token are no data of any other reply."""
         reads = self._harmless(outstanding, spans)
-        if not reads or self._kind.is_loopback(probe_token):
+        if not reads or probe_token == PROOF or self._kind.is_loopback(probe_token):
             return None
         return self.reply_shape(reads.pick(probe_token))
 

@@ -14,7 +14,7 @@ from itertools import count, repeat
 from typing import Any, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Refused, Took
-from gateway.protocols.driver import EVERY_REQUEST, Span, Talk, Unit
+from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span, Talk, Unit
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Place
@@ -204,7 +204,7 @@ class Master(Settings):
     ) -> Callable[[int], Span]:
         """Returns the read of each probe token."""
         if inside := HarmlessReads(spans, None if self.numbered else outstanding, self.reply_shape):
-            return inside.pick
+            return lambda token: (inside.proof() if token == PROOF else None) or inside.pick(token)
         beyond = self._harmless(outstanding)
         # The device may be silent about the outstanding address: the others are asked first.
         alike = [span for span in spans if span != outstanding]
@@ -271,6 +271,9 @@ class Master(Settings):
     ) -> Hashable:
         """None for function 08 with its token."""
         if self.diagnostics:
+            return None
+        inside = HarmlessReads(spans, outstanding, self.reply_shape)
+        if probe_token == PROOF and inside.proof() is None:
             return None
         return self.reply_shape(self._harmless_pick(outstanding, spans)(probe_token))
 

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import Address, Cost, Span, Talk, Timing, Traits, Unit
+from gateway.protocols.driver import PROOF, Address, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.vigor.codec import (
@@ -50,6 +50,7 @@ _REFUSALS = {
 _TRAITS = Traits(baudrate=19200, format="7E1", one_format=True)
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
 _PROBE_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: no read of words has these
+_PROOF_SIZE = 17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,6 +249,8 @@ def _pick(outstanding: Span | None, spans: Sequence[Span]) -> Callable[[int], Sp
     inside = HarmlessReads(spans, outstanding, _bytes)
 
     def pick(token: int) -> Span:
+        if token == PROOF:
+            return inside.proof(_PROBE_SIZES) or Span("M", 0, 8 * _PROOF_SIZE)
         if inside:
             token, in_turn = token // 4 * 2 + token % 2, token // 2 % 2
             if in_turn:
