@@ -96,7 +96,7 @@ TINY = [
     ),
 ]
 PICTURES = ["pictures", "--after", "0", "--into"]
-BY_OTHER_TESTS = {"moves", "structure"}  # tests/engine/test_structure.py
+BY_OTHER_TESTS = {"moves", "structure", "schemas"}  # test_structure.py, test_schemas.py
 PARTS_OF_OTHERS = {"__init__", "checkouts", "paced_wire", "plant_consumer", "words"}
 
 

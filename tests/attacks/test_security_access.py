@@ -58,7 +58,7 @@ USERS = {
 def with_other_rights(page_rules: str) -> dict[str, Any]:
     """Returns the rules of the page with three users more, as the page explains."""
     found: dict[str, Any] = rules(page_rules)
-    kept, like_write, like_outcome, _, _, one_device, some_tags = [
+    kept, like_write, like_outcome, _, _, described, one_device, some_tags = [
         re.findall(r"`([^`]+)`", unit.text)
         for unit in units(RULES)
         if unit.section == "Other rights"
@@ -77,6 +77,10 @@ def with_other_rights(page_rules: str) -> dict[str, Any]:
     assert (like_write[0], like_outcome, len(commands)) == ("write", ["outcome"], 4)
     own = [copied(rule, f"commands-{rule}", commands) for rule in ("write", "outcome")]
     permit("commander", kept + own)
+    *keys, ask, tell, offer, asked = described
+    for each in found["rules"]:
+        if each["id"] in (ask, tell, offer, asked):
+            each["key_exprs"] = [*each["key_exprs"], *keys]
     only, all_of_them, rule, kept_rule = one_device
     assert [all_of_them] == next(r["key_exprs"] for r in found["rules"] if r["id"] == rule)
     others = next(policy["rules"] for policy in found["policies"] if "ask" in policy["rules"])
@@ -186,6 +190,8 @@ async def reads(person: ZenohPeer, rights: Rights) -> None:
         ("plant/**/@meta", VALUES),
         ("plant/*/@block", 1),
         ("plant/@gateway/demo/lines/*", 2),
+        ("plant/@gateway/demo/@describe", 1),
+        ("plant/@gateway/*/@introspect", 1),
         (f"{STATUS[:-6]}audit/*?_time=[now(-1h)..]", 0),  # the file keeps none
         (f"{ALARMS}/**", 5),  # of a tag, two devices and two lines
         ("plant/mixer/speed?max_age=1h", 1),

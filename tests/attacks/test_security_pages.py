@@ -249,6 +249,9 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "**Alarms.** A user who may read may also acknowledge alarms, unless the user has the rule "
         "`acknowledge-none`. Such a user reads alarms with a `get` on "
         "`plant/@gateway/*/alarms/**`.": (USERS,),
+        "**Self-description.** No wildcard matches `plant/@gateway/*/@describe` and "
+        "`plant/@gateway/*/@introspect`. To let clients read [them](contract.md), add both keys to "
+        "the rules `ask` and `tell`, at a router also to `offer` and `asked`.": (USERS,),
         "**One device only.** To let a user write one device only, use `plant/mixer/**/@set` "
         "instead of `plant/**/@set` in a rule of its own like `write`. The rule `outcome` stays as "
         "it is: the gateway declares the whole key.": (USERS,),
