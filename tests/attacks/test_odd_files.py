@@ -106,29 +106,28 @@ def coming_and_going(path: Path) -> Iterator[None]:
 
 
 async def test_a_file_that_is_odd_changes_nothing(tmp_path: Path) -> None:
-    (folder := tmp_path / os.fsdecode(b"\xff")).mkdir()  # which is no UTF-8
     at = free_port(), (endpoint := free_endpoint())
-    secret(folder / TOKENS, "page:" + "t" * 40 + "\n")
-    secret(folder / WRITERS, ALICE + "\n")
-    (folder / "speeds.csv").write_text("name;address\nspeed;D10\n")
-    (folder / "loop").symlink_to("loop")
-    with await asyncio.to_thread(started, plant(folder, *at)) as program:
+    secret(tmp_path / TOKENS, "page:" + "t" * 40 + "\n")
+    secret(tmp_path / WRITERS, ALICE + "\n")
+    (tmp_path / "speeds.csv").write_text("name;address\nspeed;D10\n")
+    (tmp_path / "loop").symlink_to("loop")
+    with await asyncio.to_thread(started, plant(tmp_path, *at)) as program:
         await asyncio.to_thread(program.says, "device online")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             gateway, alice = Gateway(program, client), Writer(client, ALICE)
             await alice.until("ok")
             for section, setting, names in ODD_PATHS:
                 for name in names:
-                    plant(folder, *at, section, setting, name)
+                    plant(tmp_path, *at, section, setting, name)
                     [mistake] = await gateway.reload()
                     assert f"{section}.{setting}" in mistake, name
-            plant(folder, *at)
+            plant(tmp_path, *at)
             assert await gateway.reload() == []
 
             before = gateway.memory
             for name in FILES:
-                path = folder / name
-                away = path.rename(folder / "away")
+                path = tmp_path / name
+                away = path.rename(tmp_path / "away")
                 for kind in KINDS:
                     make(kind, path)
                     why = await gateway.reload()
@@ -137,13 +136,13 @@ async def test_a_file_that_is_odd_changes_nothing(tmp_path: Path) -> None:
                     await gateway.goes_on()
                     if name == WRITERS:
                         await alice.until("not-allowed")
-                    path.rename(folder / f"{kind} {name}")
+                    path.rename(tmp_path / f"{kind} {name}")
                 away.rename(path)
             await alice.until("ok")
             assert gateway.memory - before < 300 * MB
 
             # As one that is written anew and renamed, at each change of an alarm.
-            with coming_and_going(folder / "alarms.json.bad"):
+            with coming_and_going(tmp_path / "alarms.json.bad"):
                 for _ in range(RELOADS):
                     assert await gateway.reload() == []
             await gateway.goes_on()

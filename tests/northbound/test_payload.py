@@ -247,3 +247,8 @@ def test_the_audit_line_is_written_for_every_requested_value(requested: Value | 
     assert document["outcome"] == "busy"
     assert document["key"] == "plant/mixer/recipe"
     assert len(str(document["value"])) < 400
+
+
+def test_a_document_with_the_name_of_a_file_that_is_no_text_is_text() -> None:
+    found = payload.document({Problem.BUSY: 1, "file": "/x\udcff/plant.yaml"})
+    assert json.loads(found) == {"busy": 1, "file": "/x?/plant.yaml"}
