@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import structlog
 
+from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.jobs.unanswered import Unanswered
 from gateway.errors import Garbled, LineDown
 from gateway.line.wire_log import WireLog
@@ -186,16 +187,17 @@ class Channel:
         """Keeps the line silent for so long, while stations process a broadcast."""
         self.quiet_since += seconds
 
-    async def quiet(self, silence: float) -> None:
+    async def quiet(self, silence: StationSilence) -> None:
         """Waits for the silence before a request. Checks the clock: a loop may wake too early.
 
-        Raises `Garbled` if the wire does not become silent.
+        Bytes that arrive meanwhile may bring the safe silence back. Raises `Garbled` if the wire
+        does not become silent.
         """
         # Event loops round sleeps up by about a millisecond.
         spin = SPIN if self.wire.baudrate > FAST else 0.0
-        until = max(self.quiet_since, self.now()) + silence + LONGEST_WAIT
-        while (wait := self.quiet_since + silence - self.now()) > 0:
-            if self.quiet_since + silence > until:
+        until = max(self.quiet_since, self.now()) + LONGEST_WAIT
+        while (wait := self.quiet_since + silence.kept - self.now()) > 0:
+            if self.quiet_since > until:
                 raise Garbled("the line is never quiet, nothing was sent: noise, or another master")
             await asyncio.sleep(wait - spin if wait > spin else 0)
 

@@ -97,7 +97,7 @@ class Transaction:
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
-        await channel.quiet(self._device.silence.kept)
+        await channel.quiet(self._device.silence)
         self._send(data, channel.now())
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
@@ -113,9 +113,8 @@ class Transaction:
         channel, device = self._channel, self._device
         started = channel.now()
         if not self._open:
-            kept = device.silence.kept
-            if channel.quiet_since + kept > started:
-                await channel.quiet(kept)
+            if channel.quiet_since + device.silence.kept > started:
+                await channel.quiet(device.silence)
                 started = channel.now()
             self._begin_hearing()
             silence = started - channel.quiet_since

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 from structlog.testing import capture_logs
 
+from gateway.engine.device.station_silence import StationSilence
 from gateway.errors import Garbled
 from gateway.line.channel import KEPT, LONGEST_WAIT, NEVER, Alarm, Channel, Echo
 from gateway.line.wire_log import WireLog
@@ -169,6 +170,8 @@ def test_other_bytes_after_a_transaction_end_the_wait_for_the_echo() -> None:
 
 # The silence before a request
 
+SAFE = StationSilence(0.005, least=0.005)
+
 
 def channel(baudrate: int = 9600) -> Channel:
     return Channel(FakePort(), WireTiming(baudrate, 10), WireLog(), Echo("hall", None))
@@ -179,15 +182,30 @@ def channel(baudrate: int = 9600) -> Channel:
 async def test_the_silence_counts_from_the_last_busy_moment(baudrate: int) -> None:
     port, start = channel(baudrate), now()
     port.quiet_since = start + 0.004
-    await port.quiet(0.005)
+    await port.quiet(SAFE)
     assert 0.009 - 1e-9 <= now() - start <= 0.0091
+
+
+@on_virtual_time
+async def test_bytes_in_a_shorter_silence_bring_the_safe_one_back_for_the_request_that_waits() -> (
+    None
+):
+    port, silence = channel(), StationSilence(0.005, least=0.001)
+    silence.keep(0.002)
+    port.quiet_since = now()
+    waiting = asyncio.create_task(port.quiet(silence))
+    await asyncio.sleep(0.001)
+    heard = port.quiet_since = now()
+    silence.keep_safe(at_rest=True)
+    await waiting
+    assert now() - heard == pytest.approx(0.005)
 
 
 @on_virtual_time
 async def test_a_silence_that_is_over_is_not_waited_for() -> None:
     port, start = channel(), now()
     port.quiet_since = start - 0.005
-    await port.quiet(0.005)
+    await port.quiet(SAFE)
     assert now() == start
 
 
@@ -213,7 +231,7 @@ async def test_above_19200_baud_the_last_millisecond_is_spent_at_the_clock(
     port, start = channel(baudrate), now()
     port.quiet_since = start
     loop = LateLoop(monkeypatch)
-    await port.quiet(0.005)
+    await port.quiet(SAFE)
     assert now() - start == pytest.approx(0.005 + late, abs=5e-5)
     assert (loop.asked.count(0) > 1) == (late == 0.0)
 
@@ -231,7 +249,7 @@ async def test_a_line_that_is_never_quiet_is_garbled_after_a_second(baudrate: in
     port.quiet_since = start
     babbling = asyncio.create_task(babble())
     with pytest.raises(Garbled, match="never quiet, nothing was sent"):
-        await port.quiet(0.005)
+        await port.quiet(SAFE)
     babbling.cancel()
     assert LONGEST_WAIT <= now() - start < LONGEST_WAIT + 0.02
 
@@ -241,5 +259,5 @@ async def test_a_pause_delays_the_next_request() -> None:
     port = channel()
     sent = port.quiet_since = now()
     port.pause(0.1)
-    await port.quiet(0.005)
+    await port.quiet(SAFE)
     assert now() - sent == pytest.approx(0.105)
