@@ -144,7 +144,7 @@ class Keys:
 
     @property
     def introspect(self) -> str:
-        """What this gateway serves."""
+        """The key of the keys, verbs and devices that this gateway serves."""
         return f"{self.own}/@introspect"
 
     @property

@@ -67,7 +67,7 @@ class DeviceServer:
 
     @property
     def words(self) -> tuple[bytes, ...]:
-        """What it sends by itself: no bytes of the line. Some send the registration each time."""
+        """The bytes that it sends by itself: none are of the line. Some register each time."""
         return tuple(word for word in (self.registration, self.heartbeat) if word)
 
     def allows(self, address: str) -> bool:

@@ -50,7 +50,7 @@ class DeviceSection(Section):
     late_guard: Duration | None = None
     """The longest wait for a late reply after a time-out, before the next request."""
     identity: Annotated[dict[str, str] | None, Parsed(parsers.identity, IDENTITY_SCHEMA)] = None
-    """What the device must tell of itself: vendor, model, serial, or the value of a tag."""
+    """Vendor, model or serial number that the device must tell, or the value of a tag."""
     blocks: Annotated[
         bool | Literal["only"], Parsed(parsers.blocks, {"enum": [True, False, "only"]})
     ] = False

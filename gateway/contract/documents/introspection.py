@@ -1,4 +1,4 @@
-"""What one gateway serves: its keys, what a client may do there, its devices."""
+"""The keys that one gateway serves, what a client may do there, and its devices."""
 
 from collections.abc import Iterable, Mapping
 

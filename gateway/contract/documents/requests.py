@@ -165,7 +165,7 @@ class Piece(TypedDict):
 
 
 class TraceDocument(TypedDict):
-    """What passed on a line."""
+    """The exchanges and bytes that passed on a line."""
 
     number: int
     missed: int
