@@ -106,7 +106,8 @@ def view(found: Sequence[dict[str, Any]]) -> RenderableType:
     for one in found:
         limit = "" if one["limit"] in (None, True, False) else f" {one['limit']:g}"
         by = one["acknowledged"]
-        texts = (one["text"], one.get("detail", "") if one["value"] is True else "")
+        part = f"part of {one['part_of']}" if "part_of" in one else ""
+        texts = (one["text"], part or (one.get("detail", "") if one["value"] is True else ""))
         table.add_row(
             Text(printable(one["alarm"])),
             Text(one["state"], style=_STYLES.get(one["state"], "")),

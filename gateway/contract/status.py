@@ -24,6 +24,7 @@ from gateway.tags.timestamps import rfc3339
 
 MOST_REQUESTS = 200
 MOST_TOLD = 10  # texts of one name
+BACK = 10.0  # seconds that a device of a silent line replies before that line is no longer silent
 # The words of the status documents; users read them since the first version.
 _STANDING = {State.ONLINE: "up", State.OFFLINE: "silent"}
 Document = Mapping[str, object]
@@ -33,6 +34,17 @@ def standing(device: Device) -> str:
     """starting, up, failing or silent."""
     state = device.health.state
     return _STANDING.get(state, state.value)
+
+
+def is_silent(engine: Engine, now: float) -> bool | None:
+    """True if no device of an open line replies, or has replied for `BACK`: that is one cause, the
+    line's. None: it is not known. A line with one device is never silent: its device is."""
+    asked = [device for device in engine.devices if device.health.is_probed]
+    replies = any(one.health.online and now - one.record.falls.ended >= BACK for one in asked)
+    if len(asked) < 2 or replies:
+        return False
+    states = {device.health.state for device in asked}
+    return True if State.OFFLINE in states and State.STARTING not in states else None
 
 
 def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> DeviceDocument:
@@ -109,6 +121,7 @@ def line_document(
     return {
         "open": engine.is_open,
         "trouble": record.trouble,
+        "silent": is_silent(engine, now) is True,
         "last_trouble": record.last_trouble,
         "opened": record.opened,
         "open_for": round(open_for, 1),

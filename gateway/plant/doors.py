@@ -15,17 +15,19 @@ from gateway.tags import AlarmRule, Sample, Tag
 
 
 class Reading(NamedTuple):
-    """The present state of a condition. `alarm`: None if it is not known."""
+    """The present state of a condition. `alarm`: 0 or False: it is none; None: it is not known."""
 
-    alarm: bool | None
+    alarm: float | None
     why: str = ""  # one sentence for people, or empty
 
 
 class Condition(NamedTuple):
-    """One condition: when it is an alarm, and its present state."""
+    """One condition: when it is an alarm, and its present state. `parent`: the alarm of the cause,
+    of which it is a part while that one is active."""
 
     rule: AlarmRule
     look: Callable[[], Reading]
+    parent: str = ""
 
 
 class Conditions:

@@ -1,7 +1,7 @@
 """The alarm of a tag, as the file describes it: limits, hysteresis, delay."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 
@@ -16,6 +16,7 @@ class Level(StrEnum):
     OFF = "off"
     OFFLINE = "offline"  # of a device
     DOWN = "down"  # of a line
+    SILENT = "silent"  # of a line: none of its devices replies
     STOPPED = "stopped"  # of a transfer
 
 
@@ -31,3 +32,4 @@ class AlarmRule:
     hysteresis: float = 0.0
     delay: float = 0.0
     text: str = ""  # for people
+    texts: Mapping[Level, str] = field(default_factory=dict)  # of levels with another text

@@ -71,10 +71,15 @@ async def test_operators_see_every_deed_and_each_cause_once(tmp_path: Path) -> N
                 told = {f"Ana {n}" for n, [one] in enumerate(answers) if one.ok}
                 assert len(told) > 1  # a slow disk may leave out some, and they are told so
 
-                await client.get_until(
-                    "plant/@gateway/demo/lines/yard",
-                    lambda line: {*line["devices"].values()} == {"silent"},
+                line = await client.get_until(
+                    f"{ALARMS}/line:yard", lambda alarm: alarm["state"] == "active"
                 )
+                assert (line["level"], len(line["devices"])) == ("silent", STATIONS)
+                assert re.search(r"devices are silent, no frame to \d+% .* \(for ", line["detail"])
+                pumps = [one.json for one in await client.get(f"{ALARMS}/pump$*")]
+                assert {(one["state"], one["part_of"]) for one in pumps} == {
+                    ("normal", "line:yard")
+                }
                 status = await asyncio.to_thread(plc_gateway, "status", file)
                 [wrong] = re.findall(r"^wrong:\n((?: .*\n)+)", status.out, re.MULTILINE)
                 assert re.search(r"line yard: .* devices are silent, no frame to ", wrong)

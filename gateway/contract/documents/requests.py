@@ -118,6 +118,8 @@ class AlarmDocument(TypedDict):
     since: Time | None
     raised: Time | None
     acknowledged: Acknowledgement | None
+    devices: NotRequired[list[str]]
+    part_of: NotRequired[str]
 
 
 class AlarmEvent(AlarmDocument):

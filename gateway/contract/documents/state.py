@@ -61,6 +61,7 @@ class LineDocument(TypedDict):
 
     open: bool
     trouble: str
+    silent: NotRequired[bool]
     last_trouble: str
     opened: int
     open_for: float

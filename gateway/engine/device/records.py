@@ -67,6 +67,7 @@ class Falls:
     """The times at which a line was lost, or a device fell silent."""
 
     since: float | None = None  # it is still down; by the line's clock
+    ended: float = -math.inf  # when it was there again last
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_FALLS))
 
     def fall(self, now: float) -> None:
@@ -75,9 +76,10 @@ class Falls:
             self.since = now
             self._times.append(now)
 
-    def rise(self) -> None:
-        """Notes that it is there again."""
-        self.since = None
+    def rise(self, now: float) -> None:
+        """Notes that it is there again. It may be known already."""
+        if self.since is not None:
+            self.since, self.ended = None, now
 
     def last_day(self, now: float) -> int:
         """Returns how often it fell in the last 24 hours."""
@@ -108,7 +110,7 @@ class LineRecord:
     def open(self, now: float) -> None:
         """Notes that the port was opened."""
         self.opened += 1
-        self.falls.rise()
+        self.falls.rise(now)
         self.since, self.trouble = now, ""
 
     def lose(self, why: str, now: float, *, was_open: bool) -> None:

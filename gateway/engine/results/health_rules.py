@@ -34,7 +34,7 @@ class HealthRules:
         if health.state is State.ONLINE and not health.needs_resync:
             return
         if health.answered(resynced=resynced):
-            device.record.falls.rise()
+            device.record.falls.rise(now)
             if device.shapes is not None:
                 device.shapes.longer.restart(now)
             self._effects.online(device, True)

@@ -4,6 +4,7 @@ A scan whose tags have no alarm costs one look at the scan.
 """
 
 import asyncio
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,15 +14,17 @@ import structlog
 
 from gateway.contract import audited
 from gateway.errors import NothingToAcknowledge
-from gateway.parts.alarms.machine import Alarm, Event, State, Status
+from gateway.parts.alarms.machine import IN_ALARM, Alarm, Event, State, Status
 from gateway.plant.doors import Condition, Reading
-from gateway.tags import AlarmRule, Quality, Sample, Tag
+from gateway.tags import AlarmRule, Level, Quality, Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
 
-
+# Seconds after the end of an alarm until its parts are alarms of their own again: the devices of a
+# line that is back reply one after the other.
+OWN_AFTER = 10.0
 _UNKNOWN = Reading(None)
 
 
@@ -34,12 +37,28 @@ class Entry:
     tag: Tag | None = None
     look: Callable[[], Reading] | None = None  # only for lines and devices
     reading: Reading = _UNKNOWN  # what it returned last
+    parent: str = ""  # the alarm of which it may be a part
+    own_from: float = -math.inf  # it is no part from then on, by the loop's clock
     counted: State = State.NORMAL
     timer: asyncio.TimerHandle | None = None  # of the delay
 
     @property
     def status(self) -> Status:
         return self.alarm.status
+
+    @property
+    def in_alarm(self) -> bool:
+        return self.status.state in IN_ALARM
+
+    @property
+    def part_of(self) -> str:
+        """The key of the alarm that it is a part of; empty: it is one of its own."""
+        return self.parent if self.alarm.is_part and self.reading.alarm is not False else ""
+
+    @property
+    def text(self) -> str:
+        rule, level = self.alarm.rule, self.status.level
+        return rule.text if level is None else rule.texts.get(level, rule.text)
 
 
 # Receives each change of an alarm. Event None: only the quality of the value has changed.
@@ -53,9 +72,11 @@ class Alarms:
         """`wall`: ns since 1970."""
         self.entries: dict[str, Entry] = {}
         self.open: dict[str, Entry] = {}  # those that are not normal
+        self._kept: dict[str, Entry] = {}  # those that a restart must not lose
         self.changed = asyncio.Event()  # something is to be saved
         self._by_tag: dict[Tag, Entry] = {}
         self._watched: list[Entry] = []
+        self._parts: dict[str, list[Entry]] = {}  # by the key of their parent
         self._counts: Counter[State] = Counter()
         self._sinks: list[Sink] = []
         self._wall = wall
@@ -72,12 +93,15 @@ class Alarms:
                 self._watched.remove(entry)
                 self._remove(entry)
         for key, condition in conditions.items():
-            if (known := self.entries.get(key)) is not None:
-                known.look = condition.look  # another line or device may have its place
-            else:
-                self._watched.append(
-                    self._add(Entry(key, Alarm(condition.rule), look=condition.look))
-                )
+            if (known := self.entries.get(key)) is None:
+                known = self._add(Entry(key, Alarm(condition.rule)))
+                self._watched.append(known)
+            known.look = condition.look  # another line or device may have its place
+            known.parent = condition.parent
+        parts: dict[str, list[Entry]] = {}
+        for entry in self._watched:
+            parts.setdefault(entry.parent, []).append(entry)
+        self._parts = parts
 
     # -- a changed file --
 
@@ -105,6 +129,7 @@ class Alarms:
         if self.entries.get(entry.key) is entry:
             del self.entries[entry.key]
             self.open.pop(entry.key, None)
+            self._kept.pop(entry.key, None)
             self._counts[entry.counted] -= 1
             self.changed.set()
 
@@ -177,15 +202,22 @@ class Alarms:
             _log(entry, event)
         for sink in self._sinks:
             sink(entry, event)
+        if event is Event.RAISED:
+            for part in self.parts(entry):
+                self._fold(part)
 
     def _count(self, entry: Entry) -> None:
         self._counts[entry.counted] -= 1
         entry.counted = entry.status.state
         self._counts[entry.counted] += 1
-        if entry.counted is State.NORMAL:
-            self.open.pop(entry.key, None)
-        else:
-            self.open[entry.key] = entry
+        for found, belongs in (
+            (self.open, entry.counted is not State.NORMAL),
+            (self._kept, entry.counted is not State.NORMAL or entry.status.folded),
+        ):
+            if belongs:
+                found[entry.key] = entry
+            else:
+                found.pop(entry.key, None)
 
     # -- from operators --
 
@@ -198,7 +230,8 @@ class Alarms:
         try:
             event = entry.alarm.acknowledge(by, self._wall(), via, raised)
         except NothingToAcknowledge as error:
-            raise NothingToAcknowledge(f"alarm {key}: {error}") from None
+            why = f"it is part of {entry.part_of}: acknowledge that" if entry.part_of else error
+            raise NothingToAcknowledge(f"alarm {key}: {why}") from None
         if event is not None:
             self._report(entry, event)
         return entry
@@ -211,12 +244,37 @@ class Alarms:
             if (entry := self.entries.get(key)) is not None:
                 entry.alarm.restore(status)
                 self._count(entry)
+                if entry.alarm.is_part:
+                    entry.own_from = asyncio.get_running_loop().time() + OWN_AFTER
             else:
                 log.info("alarm left out", alarm=key, why="the configuration has no such alarm")
 
     def statuses(self) -> Mapping[str, Status]:
         """Returns the alarms that a restart must not lose."""
-        return {key: entry.status for key, entry in self.open.items()}
+        return {key: entry.status for key, entry in self._kept.items()}
+
+    def level(self, key: str) -> Level | None:
+        """Returns the level of an alarm that is reached now."""
+        entry = self.entries.get(key)
+        return entry.status.level if entry is not None and entry.in_alarm else None
+
+    # -- parts: one cause is one alarm --
+
+    def parts(self, parent: Entry) -> list[Entry]:
+        """Returns the alarms that are a part of an active one."""
+        found = self._parts.get(parent.key, ()) if parent.in_alarm else ()
+        return [one for one in found if one.reading.alarm is not False]
+
+    def _fold(self, entry: Entry) -> None:
+        now, parent = asyncio.get_running_loop().time(), self.entries.get(entry.parent)
+        if parent is not None and parent.in_alarm:
+            entry.own_from = now + OWN_AFTER
+        if now < entry.own_from:
+            event = entry.alarm.fold(self._wall())
+        else:
+            event = entry.alarm.unfold(now, self._wall())
+        if event is not None:
+            self._report(entry, event)
 
     def look(self) -> None:
         """Looks at the conditions."""
@@ -225,8 +283,14 @@ class Alarms:
 
     def _look(self, entry: Entry) -> None:
         if entry.look is not None:
+            before = entry.part_of, entry.status.folded
             entry.reading = entry.look()
             self._apply(entry, entry.reading.alarm, self._wall())
+            self._fold(entry)
+            if before != (entry.part_of, entry.status.folded):
+                self._count(entry)
+                self.changed.set()
+                self._report(entry, None)
 
     def close(self) -> None:
         """Cancels the delays."""
@@ -237,15 +301,17 @@ class Alarms:
 
 
 def _log(entry: Entry, event: Event) -> None:
-    status, rule = entry.status, entry.alarm.rule
+    status = entry.status
     fields: dict[str, object] = {"alarm": entry.key, "state": status.state.value}
     if event is Event.ACKNOWLEDGED and status.acknowledged is not None:
         by = status.acknowledged
         log.info(audited.ACKNOWLEDGED, **fields, by=by.by, via=by.via)
         return
-    fields["text"] = rule.text
+    fields["text"] = entry.text
     if entry.tag is not None:
         fields["value"] = status.value
+    if entry.part_of:
+        fields["part_of"] = entry.part_of
     if event is Event.RAISED:
         log.warning("alarm raised", **fields, limit=str(status.level))
     else:

@@ -139,6 +139,7 @@ def _status(entry: Mapping[str, Any]) -> Status:
         acknowledged=None
         if by is None
         else Acknowledgement(str(by["by"]), _time(by["time"]), by["via"]),
+        folded=entry.get("folded") is True,
     )
 
 

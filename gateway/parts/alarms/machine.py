@@ -30,6 +30,8 @@ class Event(StrEnum):
     EASED = "eased"  # only a less severe limit is still reached
     ENDED = "ended"  # no limit is reached any more
     ACKNOWLEDGED = "acknowledged"
+    FOLDED = "folded"  # it is part of another alarm now
+    UNFOLDED = "unfolded"  # it is one of its own again, and was acknowledged before
 
 
 _S, _E = State, Event
@@ -44,6 +46,9 @@ TRANSITIONS: Mapping[tuple[State, Event], State] = {
     (_S.ACKNOWLEDGED, _E.ENDED): _S.NORMAL,
     (_S.ACTIVE, _E.ACKNOWLEDGED): _S.ACKNOWLEDGED,
     (_S.RETURNED, _E.ACKNOWLEDGED): _S.NORMAL,
+    (_S.ACTIVE, _E.FOLDED): _S.NORMAL,
+    (_S.ACKNOWLEDGED, _E.FOLDED): _S.NORMAL,
+    (_S.NORMAL, _E.UNFOLDED): _S.ACKNOWLEDGED,
 }
 IN_ALARM = (State.ACTIVE, State.ACKNOWLEDGED)  # a limit is reached
 UNACKNOWLEDGED = (State.ACTIVE, State.RETURNED)
@@ -60,8 +65,8 @@ class Acknowledgement(NamedTuple):
 class Status(NamedTuple):
     """An alarm at one moment. Replaced as a whole: any thread may read it.
 
-    `level` is the worst limit that is reached; in state `returned` the last one. Times in ns since
-    1970; 0: never.
+    `level` is the worst limit that is reached; in state `returned`, or folded, the last one. Times
+    in ns since 1970; 0: never.
     """
 
     state: State = State.NORMAL
@@ -70,6 +75,7 @@ class Status(NamedTuple):
     raised: int = 0  # of the last event `raised`: an acknowledgement is for this one
     value: Value | None = None  # at the last event
     acknowledged: Acknowledgement | None = None  # of the last event `raised`
+    folded: bool = False  # it would be active or acknowledged, if it was no part of another alarm
 
 
 class _Condition:
@@ -126,12 +132,13 @@ class _Condition:
 class Alarm:
     """The alarm of one value. `now`: seconds of a steady clock; `time`: ns since 1970."""
 
-    __slots__ = ("_conditions", "good", "rule", "status", "value")
+    __slots__ = ("_conditions", "good", "is_part", "rule", "status", "value")
 
     def __init__(self, rule: AlarmRule) -> None:
         self.rule = rule
         self.status = Status()
         self.good = False  # the quality of the value
+        self.is_part = False  # of another alarm: it is judged, and raises nothing
         self.value: Value | None = None  # the last good one
         worst_first = [level for level in Level if level in rule.limits]
         self._conditions = [_Condition(rule, level, rule.limits[level]) for level in worst_first]
@@ -160,20 +167,40 @@ class Alarm:
         """Applies the delays that have ended."""
         new = [one.level for one in self._conditions if one.elapse(now)]
         level = next((one.level for one in self._conditions if one.active), None)
-        before = self.status
-        if level is (before.level if before.state in IN_ALARM else None):
+        before, was_in_alarm = self.status, self.status.state in IN_ALARM
+        if before.folded and level is None:
+            self.status = before = before._replace(folded=False, level=None)
+        if self.is_part or level is (before.level if was_in_alarm else None):
             return None
         event = Event.ENDED
-        if level is not None:
-            event = Event.RAISED if level in new else Event.EASED
+        if level is not None and before.folded and before.acknowledged is not None:
+            event = Event.UNFOLDED
+        elif level is not None:
+            event = Event.RAISED if level in new or not was_in_alarm else Event.EASED
         state = TRANSITIONS[before.state, event]
-        changed = before._replace(state=state, since=time, value=self.value)
+        changed = before._replace(state=state, since=time, value=self.value, folded=False)
         if event is Event.RAISED:
             changed = changed._replace(level=level, raised=time, acknowledged=None)
-        elif event is Event.EASED or state is State.NORMAL:
+        elif event in (Event.EASED, Event.UNFOLDED) or state is State.NORMAL:
             changed = changed._replace(level=level)
         self.status = changed
         return event
+
+    def fold(self, time: int) -> Event | None:
+        """Makes it part of another alarm, until `unfold`. Its acknowledgement is kept."""
+        self.is_part = True
+        if self.status.state not in IN_ALARM:
+            return None
+        state = TRANSITIONS[self.status.state, Event.FOLDED]
+        self.status = self.status._replace(state=state, since=time, folded=True)
+        return Event.FOLDED
+
+    def unfold(self, now: float, time: int) -> Event | None:
+        """Makes it an alarm of its own again: raised, if a limit is still reached."""
+        if not self.is_part:
+            return None
+        self.is_part = False
+        return self.elapse(now, time)
 
     def acknowledge(
         self, by: str, time: int, via: str | None = None, raised: int | None = None
@@ -202,12 +229,14 @@ class Alarm:
     def restore(self, status: Status) -> None:
         """Takes over the status before a restart. A limit that the file no longer has is left."""
         levels = [one.level for one in self._conditions]
+        if status.folded and status.level not in levels:
+            status = status._replace(folded=False, level=None)
         if status.state in IN_ALARM and status.level not in levels:
             state = TRANSITIONS[status.state, Event.ENDED]
             level = status.level if state is State.RETURNED else None
             status = status._replace(state=state, level=level)
-        self.status = status
-        if status.state not in IN_ALARM or status.level is None:
+        self.status, self.is_part = status, status.folded
+        if not (status.folded or status.state in IN_ALARM) or status.level is None:
             return
         is_below = status.level in BELOW
         for condition in self._conditions[levels.index(status.level) :]:

@@ -21,6 +21,7 @@ from gateway.plant.part import Audits, Core, Kind
 from gateway.tags import Level, Quality, Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
+from gateway.values import Value
 
 LOOK_EVERY = 1.0  # seconds between two looks at the conditions
 MOST_SHOWN = 50  # on the status page
@@ -58,7 +59,9 @@ class AlarmPart:
     def _watch(self) -> None:
         """Follows the conditions of the plant and of other parts."""
         found = self._plant.doors.conditions
-        found.put("alarms", conditions(self._plant.lines, self._settings))
+        now = asyncio.get_running_loop().time
+        own = conditions(self._plant.lines, self._settings, self.alarms.level, now)
+        found.put("alarms", own)
         self.alarms.watch(found.all(without=() if self._settings.transfers else ("transfers",)))
 
     async def take_over(self, config: Config, renewed: Mapping[Tag, Tag]) -> None:
@@ -89,14 +92,14 @@ class AlarmPart:
         return payload.document(self._fields(entry))
 
     def _fields(self, entry: Entry) -> dict[str, object]:
-        return alarm_fields(entry, self._plant.sample)
+        return alarm_fields(entry, self._plant.sample, self.alarms.parts(entry))
 
     def _changed(self, entry: Entry, event: Event | None) -> None:
         """`event` None: only the quality of the value has changed."""
         self._publish(entry)
         if event is None:
             return
-        fields = {"event": event.value, **self._fields(entry)}
+        fields = {"event": _TOLD.get(event, event), **self._fields(entry)}
         changed = payload.document(fields).decode()
         if event is Event.ACKNOWLEDGED:
             for part in self._core.others.each(Audits):
@@ -184,33 +187,43 @@ KIND = Kind(AlarmPart, serves=Keyed)
 LONGEST_NAME = 100  # characters of an operator's name
 _LONGEST = 2000  # bytes of an acknowledgement
 _OF_BITS = {Level.ON: True, Level.OFF: False}
-_WATCHED = (Level.OFFLINE, Level.DOWN, Level.STOPPED)
+_WATCHED = (Level.OFFLINE, Level.DOWN, Level.SILENT, Level.STOPPED)
+# In the documents a part has ended, with `part_of`.
+_TOLD = {Event.FOLDED: Event.ENDED, Event.UNFOLDED: Event.RAISED}
 # The first alarms of a list: those that nobody has acknowledged.
 _ORDER = {State.ACTIVE: 0, State.RETURNED: 1, State.ACKNOWLEDGED: 2, State.NORMAL: 3}
 
 
-def alarm_fields(entry: Entry, sample: Callable[[Tag], Sample]) -> dict[str, object]:
+def alarm_fields(
+    entry: Entry, sample: Callable[[Tag], Sample], parts: Sequence[Entry] = ()
+) -> dict[str, object]:
     """Returns the document of an alarm. Any thread may call it."""
-    status, rule = entry.status, entry.alarm.rule
+    status = entry.status
+    level = None if status.state is State.NORMAL else status.level
+    at_change: Value | None = status.value
     if entry.tag is not None:
         known: dict[str, object] = {**payload.sample_fields(sample(entry.tag))}
     else:
         alarm, why = entry.reading
         quality = Quality.BAD if alarm is None else Quality.GOOD
-        known = {"value": alarm, "quality": quality.value, **({"detail": why} if why else {})}
+        value = None if alarm is None else bool(alarm)
+        known = {"value": value, "quality": quality.value, **({"detail": why} if why else {})}
+        at_change = None if at_change is None else bool(at_change)
     by = status.acknowledged
     return {
         "alarm": entry.key,
         "state": status.state.value,
-        "level": None if status.level is None else status.level.value,
-        "limit": _limit(entry, status.level),
+        "level": None if level is None else level.value,
+        "limit": _limit(entry, level),
         **known,
-        "value_at_change": payload.loggable(status.value),
+        "value_at_change": payload.loggable(at_change),
         "unit": "" if entry.tag is None else entry.tag.label.unit,
         "since": rfc3339(status.since) if status.since else None,
         "raised": rfc3339(status.raised) if status.raised else None,
         "acknowledged": by and {"by": by.by, "time": rfc3339(by.time), "via": by.via},
-        "text": rule.text,
+        "text": entry.text,
+        **({"part_of": entry.part_of} if entry.part_of else {}),
+        **({"devices": [part.key for part in parts]} if parts else {}),
     }
 
 

@@ -1,8 +1,10 @@
-"""The alarms that need no setting: devices that do not reply, lines that are down."""
+"""The alarms that need no setting: devices that do not reply, lines that are down or silent."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 
+from gateway.contract.line_faults import line_fault
+from gateway.contract.status import device_document, is_silent
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.line.line import Line
@@ -14,27 +16,53 @@ from gateway.tags import AlarmRule, Level
 # server that starts again, is back earlier.
 LINE_DELAY = 3.0
 LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
+_SILENT, _DOWN = 1.0, 2.0  # readings of a line
+LevelOf = Callable[[str], Level | None]  # of an alarm that is active, by its key
 
 
-def conditions(lines: Iterable[Line], config: AlarmsSection) -> dict[str, Condition]:
-    """Returns the conditions of lines and of their devices, by the key of their alarm."""
+def conditions(
+    lines: Iterable[Line], config: AlarmsSection, level_of: LevelOf, now: Callable[[], float]
+) -> dict[str, Condition]:
+    """Returns the conditions of lines and of their devices, by the key of their alarm. `now`: by
+    the line's clock."""
     found = {}
     for line in lines:
         name = line.engine.name
+        key = f"{LINE}{name}"
         if config.lines:
-            rule = AlarmRule({Level.DOWN: True}, delay=LINE_DELAY, text=f"line {name} is down")
-            found[f"{LINE}{name}"] = Condition(rule, partial(_line, line))
+            rule = AlarmRule(
+                {Level.DOWN: _DOWN, Level.SILENT: _SILENT},
+                delay=LINE_DELAY,
+                text=f"line {name} is down",
+                texts={Level.SILENT: f"line {name} is silent"},
+            )
+            found[key] = Condition(rule, partial(_line, line, partial(level_of, key), now))
         for device in line.engine.devices if config.devices else ():
             rule = AlarmRule({Level.OFFLINE: True}, text=f"{device.name} does not reply")
-            found[device.name] = Condition(rule, partial(_device, device))
+            parent = key if device.health.is_probed else ""
+            found[device.name] = Condition(rule, partial(_device, device), parent)
     return found
 
 
-def _line(line: Line) -> Reading:
-    if line.engine.is_open:
-        return Reading(False)
-    # A line that was not tried yet is not down.
-    return Reading(True if line.tried.is_set() else None, line.engine.record.trouble)
+def _line(line: Line, level: Callable[[], Level | None], now: Callable[[], float]) -> Reading:
+    engine = line.engine
+    if not engine.is_open:
+        # A line that was not tried yet is not down.
+        return Reading(_DOWN if line.tried.is_set() else None, engine.record.trouble)
+    match is_silent(engine, now()):
+        case True:
+            return Reading(_SILENT, _why_silent(line, now()))
+        case None if level() is Level.SILENT:
+            return Reading(None, "it is not known yet which devices reply again")
+    return Reading(0.0)
+
+
+def _why_silent(line: Line, now: float) -> str:
+    """Returns the sentences of the status."""
+    name, devices = line.engine.name, line.engine.devices
+    documents = [(device.name, device_document(device, (), now)) for device in devices]
+    told = line_fault(name, {"open": True}, documents)
+    return "; ".join(sentence.removeprefix(f"line {name}: ") for sentence in told)
 
 
 def _device(device: Device) -> Reading:

@@ -129,13 +129,15 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
 def _lines(documents: Documents) -> Iterator[Metric]:
     lines = [*below("lines/", documents)]
     up = _family("line_up", "1: the port is open", "line")
+    silent = _family("line_silent", "1: none of its devices replies, which is one cause", "line")
     expected = _family(
         "line_expected_load_ratio", "Load that check predicts, with transfers; 1 is all", "line"
     )
     for name, document in lines:
         up.add_metric([name], document["open"])
+        silent.add_metric([name], document.get("silent", False))
         expected.add_metric([name], document["expected"]["load"])
-    yield from (up, expected, *_calls(documents))
+    yield from (up, silent, expected, *_calls(documents))
     for metric, field, text in _LINE:
         family = _family(metric, text, "line")
         for name, document in lines:

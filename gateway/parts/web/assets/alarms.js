@@ -9,7 +9,7 @@ const MOST = 5000;
 const EVERY = 4000; // ms between two requests for what is not in the events
 const LEVELS = {
   high_high: "far too high", high: "too high", low: "too low", low_low: "far too low", on: "on", off: "off",
-  offline: "offline", down: "down", stopped: "stopped",
+  offline: "offline", down: "down", silent: "silent", stopped: "stopped",
 };
 
 let all = [];
@@ -61,7 +61,7 @@ addEventListener("hashchange", showAll);
 
 function why(one) {
   const limit = typeof one.limit === "number" ? ` (${one.limit})` : "";
-  const level = { on: "", off: "", offline: "", down: "", stopped: "" }[one.level] ?? `${LEVELS[one.level] ?? ""}${limit}`;
+  const level = { on: "", off: "", offline: "", down: "", silent: "", stopped: "" }[one.level] ?? `${LEVELS[one.level] ?? ""}${limit}`;
   const text = one.text || one.alarm;
   return [text, level].filter(Boolean).join(": ") || LEVELS[one.level];
 }
@@ -71,8 +71,11 @@ function makeRow() {
   row.why = h("b", { className: "why" });
   row.detail = h("span", { className: "detail" });
   row.where = h("span", { className: "where" });
+  row.count = h("summary");
+  row.names = h("span");
+  row.parts = h("details", {}, row.count, row.names);
   row.button = h("button", { type: "button", onclick: () => acknowledge(row.alarm) }, "Acknowledge");
-  row.append(h("div", {}, row.why, row.detail, row.where), row.button);
+  row.append(h("div", {}, row.why, row.detail, row.where, row.parts), row.button);
   return row;
 }
 
@@ -85,6 +88,10 @@ function showRow(row, one) {
   const done = state === "acknowledged";
   const by = done ? `acknowledged by ${acknowledged.by}, ${moment(Date.parse(acknowledged.time))}` : `${state} since ${moment(Date.parse(one.since))}`;
   put(row.where, [one.alarm.replace(/^line:/, "line "), "time" in one ? text : "", by].filter(Boolean).join(" · "));
+  const parts = one.devices ?? [];
+  row.parts.hidden = !parts.length;
+  put(row.count, `${parts.length} devices`);
+  put(row.names, parts.join(", "));
   row.button.hidden = done || !gateway.you[1];
   row.button.setAttribute("aria-label", `acknowledge ${one.alarm}`);
   style(row, `alarm ${state}`);
