@@ -10,8 +10,8 @@ import pytest
 from gateway.config import load
 from gateway.contract.status import BACK, is_silent
 from gateway.engine.device.health import State as Health
-from gateway.errors import NoReply, NothingToAcknowledge
-from gateway.parts.alarms.board import OWN_AFTER
+from gateway.errors import LineDown, NoReply, NothingToAcknowledge
+from gateway.parts.alarms.board import OWN_AFTER, Entry
 from gateway.parts.alarms.file import parse, snapshot
 from gateway.parts.alarms.machine import Alarm, Event, State
 from gateway.parts.alarms.part import AlarmPart
@@ -101,16 +101,15 @@ class Hall:
         self.plant = Plant(load(file))
         self.part: AlarmPart = alarms_of(self.plant)
         self.told: list[dict[str, Any]] = []
-        self.part.alarms.subscribe(
-            lambda entry, event: event and self.told.append(self._row(entry, event))
-        )
+        self.part.alarms.subscribe(self._changed)
         [self.line] = self.plant.lines
         self.engine = self.line.engine
         self.devices = self.engine.devices
         self.open()
 
-    def _row(self, entry: Any, event: Event) -> dict[str, Any]:
-        return {"event": str(event), **orjson.loads(self.part.document(entry))}
+    def _changed(self, entry: Entry, event: Event | None) -> None:
+        if event is not None:
+            self.told.append({"event": str(event), **orjson.loads(self.part.document(entry))})
 
     def open(self) -> None:
         self.line.tried.set()
@@ -204,7 +203,7 @@ async def test_a_line_that_goes_down_takes_the_alarms_of_its_devices(tmp_path: P
     hall = Hall(tmp_path)
     hall.falls(1, 2, 3)
     await hall.wait(5)
-    hall.engine.lost("unplugged", hall.now, 1)
+    hall.engine.lost(LineDown("unplugged"), hall.now, 1)
     await hall.wait(5)
     assert hall.document("line:hall")["level"] == "down"
     assert hall.states() == "active normal normal normal"
@@ -222,7 +221,7 @@ async def test_a_silent_line_whose_port_was_opened_again_stays_silent(tmp_path: 
     hall = Hall(tmp_path)
     hall.falls(1, 2, 3)
     await hall.wait(5)
-    hall.engine.lost("opened again", hall.now, 1)
+    hall.engine.lost(LineDown("opened again"), hall.now, 1)
     await hall.wait(1)
     hall.events()
     hall.open()
@@ -269,17 +268,18 @@ async def test_without_an_alarm_of_the_line_each_device_has_its_own(tmp_path: Pa
 async def test_a_line_is_silent_if_no_device_replies_for_long(tmp_path: Path) -> None:
     hall = Hall(tmp_path, 2)
     seen = []
-    for change, wait in (
-        (lambda: None, 0.0),  # starting
-        (lambda: hall.falls(1), 0.0),
-        (lambda: hall.falls(2), 0.0),  # all
-        (lambda: hall.replies(1), BACK - 0.1),  # a garbled line has such moments
-        (lambda: None, 0.2),
-        (lambda: hall.falls(1), 0.0),
-        (lambda: hall.replies(1, 2), 0.0),  # nobody knows
-        (lambda: None, BACK),
+    for falling, replying, wait in (
+        ((), (), 0.0),  # starting
+        ((1,), (), 0.0),
+        ((2,), (), 0.0),  # all
+        ((), (1,), BACK - 0.1),  # a garbled line has such moments
+        ((), (), 0.2),
+        ((1,), (), 0.0),
+        ((), (1, 2), 0.0),  # not known
+        ((), (), BACK),
     ):
-        change()
+        hall.falls(*falling)
+        hall.replies(*replying)
         await asyncio.sleep(wait)
         seen.append(is_silent(hall.engine, hall.now))
     assert seen == [None, None, True, True, False, True, None, False]
