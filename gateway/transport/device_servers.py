@@ -186,6 +186,8 @@ class _Door:
             self._unregistered.pop(one).cancel()
             one.server = max(found, key=lambda server: len(server.registration))
             self._registered(one, one.server)
+        elif len(one.greeting) == LONGEST_REGISTRATION:
+            self._refuse(one)  # whatever follows, it is a stranger
 
     def lost(self, one: _Connection) -> None:
         if (late := self._unregistered.pop(one, None)) is not None:

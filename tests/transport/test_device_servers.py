@@ -10,7 +10,7 @@ import pytest
 from gateway.errors import LineDown
 from gateway.transport import Port, SerialSettings, open_port
 from gateway.transport.device_servers import MOST_UNREGISTERED, close_doors
-from gateway.transport.port import DeviceServer, ListenAddress, parse_port
+from gateway.transport.port import LONGEST_REGISTRATION, DeviceServer, ListenAddress, parse_port
 from tests.transport.ends import PATIENCE, RecordingReceiver, free_port, listening
 
 MODULE = "gateway.transport.device_servers"
@@ -174,6 +174,20 @@ async def test_a_flood_of_strangers_keeps_no_device_server_out() -> None:
         async with asyncio.timeout(PATIENCE):
             assert await _ended(asyncio.ensure_future(strangers[0][0].read()))
         far[1].write(b"DTU-1")
+        await exchanged(await opening, heard, far, b"served")
+
+
+async def test_a_stranger_that_pours_is_closed_when_no_registration_can_fit_any_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(f"{MODULE}.REGISTERS_WITHIN", 2 * PATIENCE)
+    longest = b"DTU-".ljust(LONGEST_REGISTRATION, b"7")
+    where, heard = address(DeviceServer(longest)), RecordingReceiver()
+    opening = asyncio.create_task(opened(where, heard))
+    async with calling(where, longest[:-1] + b"8") as stranger, calling(where) as far:
+        async with asyncio.timeout(PATIENCE):
+            assert await _ended(asyncio.ensure_future(stranger[0].read()))
+        far[1].write(longest)
         await exchanged(await opening, heard, far, b"served")
 
 
