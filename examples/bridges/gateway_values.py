@@ -45,9 +45,11 @@ def is_value(known: Any) -> bool:
         return False
     if known["quality"] == "bad":
         return value is None and isinstance(reason, str)
+    if known["quality"] != "good" and not (known["quality"] == "uncertain" and reason):
+        return False
     if isinstance(value, list):  # of an array
-        return known["quality"] == "good" and all(map(is_number, value))
-    return known["quality"] == "good" and (is_number(value) or isinstance(value, str))
+        return all(map(is_number, value))
+    return is_number(value) or isinstance(value, str)
 
 
 def is_number(value: object) -> bool:

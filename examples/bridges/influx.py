@@ -19,6 +19,7 @@ go to the standard output, for Telegraf's `inputs.execd`.
   number is exact in `text` only.
 * The time is that of the sample. A value that becomes good again without a new sample has the time
   of its return.
+* An uncertain sample, outside the range of its sensor, has its value and `good=false`.
 * A bad sample has no value. A chart of the last value must look at the last `good` too.
 * While the server does not answer, up to `--queue` lines wait. They are sent again with the same
   time, so that a second copy replaces the first. Beyond that the oldest are lost. Lines that the
@@ -48,14 +49,17 @@ REFUSED = (400, 413, 422)  # for ever; other errors are those of the server or o
 def line_of(key: str, known: Known) -> str:
     device, _, tag = key.partition("/")
     value = known["value"]
+    good = "good=true"
     if known["quality"] != "good":
-        fields = f"good=false,reason={quoted(known.get('reason', ''))}"
+        good = f"good=false,reason={quoted(known.get('reason', ''))}"
+    if value is None:
+        fields = good
     elif isinstance(value, list):
-        fields = ",".join(f"value_{n}={float(one)!r}" for n, one in enumerate(value)) + ",good=true"
+        fields = ",".join(f"value_{n}={float(one)!r}" for n, one in enumerate(value)) + f",{good}"
     elif isinstance(value, str):
-        fields = f"text={quoted(value)},good=true"
+        fields = f"text={quoted(value)},{good}"
     else:
-        fields = f"value={float(value)!r},good=true"
+        fields = f"value={float(value)!r},{good}"
         if isinstance(value, int) and abs(value) > 2**53:
             fields += f",text={quoted(str(value))}"
         elif "text" in known:

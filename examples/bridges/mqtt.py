@@ -133,7 +133,7 @@ class Bridge:
             with suppress(aiomqtt.MqttError):  # then the broker publishes the last will
                 await self._tell(broker, False)
                 for topic, known in self._retained.items():
-                    if b'"quality": "good"' in known:
+                    if b'"quality": "bad"' not in known:
                         await self._retain(broker, topic, json.dumps(bad("no-bridge")).encode())
 
     async def _tell(self, broker: aiomqtt.Client, online: bool) -> None:

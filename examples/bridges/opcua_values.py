@@ -46,17 +46,18 @@ def type_of(meta: Known) -> ua.VariantType:
 def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
     time = datetime.fromisoformat(known["time"]).astimezone(UTC)
     now = datetime.now(UTC)
-    code = Code.Good
-    if known["quality"] != "good":
-        code = STATUS.get(known.get("reason", ""), Code.Bad)
-    elif (variant := variant_of(known["value"], kind)) is not None:
-        if known.get("origin") == "simulated":  # no plain reading of a device: not simply Good
-            code = Code.GoodEdited
-        code |= LIMITED.get(known.get("limited", ""), 0)
-        return ua.DataValue(variant, ua.StatusCode(code), time, now)
-    else:
+    quality, reason = known["quality"], known.get("reason", "")
+    variant = None
+    if quality not in ("good", "uncertain"):
+        code = STATUS.get(reason, Code.Bad)
+    elif (variant := variant_of(known["value"], kind)) is None:
         code = Code.BadTypeMismatch
-    return ua.DataValue(ua.Variant(), ua.StatusCode(code), time, now)
+    else:
+        code = Code.Good if quality == "good" else STATUS.get(reason, Code.Uncertain)
+        if quality == "good" and known.get("origin") == "simulated":
+            code = Code.GoodEdited  # no plain reading of a device: not simply Good
+        code |= LIMITED.get(known.get("limited", ""), 0)
+    return ua.DataValue(variant or ua.Variant(), ua.StatusCode(code), time, now)
 
 
 def variant_of(value: object, kind: ua.VariantType) -> ua.Variant | None:

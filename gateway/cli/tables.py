@@ -41,11 +41,11 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) ->
         table.add_column(column, justify="right" if column == "value" else "left")
     for row in rows:
         document = row.document
-        good = is_good(row)
-        end = document.get("limited")
-        told = ["good", document.get("origin"), f"limited {end}" if end else None]
-        quality = ", ".join(str(one) for one in told if one)
-        quality = quality if good else f"bad: {document.get('reason')}"
+        good, end = is_good(row), document.get("limited")
+        quality = "good" if good else f"{document.get('quality')}: {document.get('reason')}"
+        if document.get("value") is not None:
+            more = [document.get("origin"), f"limited {end}" if end else None]
+            quality = ", ".join([quality, *(str(one) for one in more if one)])
         tag = tags.get(row.tag)
         table.add_row(
             Text(row.tag),

@@ -3,13 +3,13 @@
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
 value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
 in `detail`. A value with a name has it in `text`. One that is no plain reading of a device has its
-`origin`: `simulated` or `computed`. One at an end of its clamp is `limited`: `low` or `high`.
+`origin`: `simulated` or `computed`. One at an end of its clamp is `limited`: `low` or `high`. One
+outside the range of its sensor is `uncertain`, with a `reason`.
 Integers stay JSON integers whatever their size: beyond 2**53 a reader in JavaScript must parse them
 itself.
 """
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,12 +29,14 @@ from gateway.contract.documents.requests import (
 from gateway.contract.documents.values import (
     KnownValue,
     PlaceDocument,
+    UncertainValue,
     UnknownValue,
     ValueDocument,
 )
 from gateway.contract.problems import PROBLEMS, Failure, Problem
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.tags import Quality, Reason, Sample, WriteResult
+from gateway.tags.sample import has_json
 from gateway.tags.tag import READ
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
@@ -117,7 +119,7 @@ def audited(error: errors.GatewayError) -> Failure:
 def value(sample: Sample) -> bytes:
     """The value with quality and time. A good one in half the time that `sample_fields` takes."""
     known, tag = sample.value, sample.tag
-    if sample.quality is not _GOOD or not _has_json(known) or tag.shaping.names is not None:
+    if sample.quality is not _GOOD or not has_json(known) or tag.shaping.names is not None:
         return orjson.dumps(sample_fields(sample))
     origin = None if tag.origin is READ else tag.origin.word
     limited = None if tag.shaping.clamp is None else tag.shaping.limited(known)
@@ -129,11 +131,6 @@ def _end_of_good(time: int, origin: str | None, limited: str | None) -> bytes:
     known = "" if origin is None else f',"origin":"{origin}"'
     known += "" if limited is None else f',"limited":"{limited}"'
     return f',"quality":"good","time":"{rfc3339(time)}"{known}}}'.encode()
-
-
-def _has_json(known: Value | None) -> bool:
-    """JSON has no NaN and no infinity: they must not become a good null."""
-    return known is not None and not (isinstance(known, float) and not math.isfinite(known))
 
 
 def value_text(sample: Sample) -> bytes | None:
@@ -149,7 +146,7 @@ def value_text(sample: Sample) -> bytes | None:
 
 
 def attachment(sample: Sample) -> bytes:
-    """`{"quality": "good", "time": …}`, and a `reason` when bad."""
+    """`{"quality": "good", "time": …}`, and a `reason` if it is not good."""
     return orjson.dumps(
         {name: item for name, item in sample_fields(sample).items() if name != "value"}
     )
@@ -236,21 +233,23 @@ def document(found: object) -> bytes:
 
 def sample_fields(sample: Sample) -> ValueDocument:
     fields: ValueDocument
-    time, value = rfc3339(sample.time), sample.value
-    if sample.quality is Quality.GOOD and value is not None and _has_json(value):
-        fields = known = KnownValue(value=value, quality="good", time=time)
-        names = sample.tag.shaping.names
-        if names is not None and (text := names.text(value)) is not None:
-            known["text"] = text
+    time, value, shaping = rfc3339(sample.time), sample.value, sample.tag.shaping
+    reason = sample.reason or Reason.NOT_A_NUMBER
+    if sample.quality is Quality.BAD or value is None or not has_json(value):
+        fields = UnknownValue(value=None, quality="bad", reason=reason, time=time)
     else:
-        reason = sample.reason or Reason.NOT_A_NUMBER
-        fields = unknown = UnknownValue(value=None, quality="bad", reason=reason, time=time)
-        if sample.detail:
-            unknown["detail"] = short(sample.detail)
+        known: KnownValue | UncertainValue = KnownValue(value=value, quality="good", time=time)
+        if sample.quality is Quality.UNCERTAIN:
+            known = UncertainValue(value=value, quality="uncertain", reason=reason, time=time)
+        if shaping.names is not None and (text := shaping.names.text(value)) is not None:
+            known["text"] = text
+        if (end := shaping.limited(value)) is not None:
+            known["limited"] = end
+        fields = known
+    if sample.detail and fields["quality"] != "good":
+        fields["detail"] = short(sample.detail)
     if (origin := sample.tag.origin.word) is not None:
         fields["origin"] = origin
-    if fields["quality"] == "good" and (end := sample.tag.shaping.limited(value)) is not None:
-        fields["limited"] = end
     return fields
 
 

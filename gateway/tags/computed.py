@@ -2,28 +2,34 @@
 
 from collections.abc import Callable, Iterable, Sequence
 
-from gateway.tags.sample import Quality, Reason, Sample, bad, good
+from gateway.tags.sample import Quality, Reason, Sample, bad, converted, uncertain
 from gateway.tags.tag import Tag
 
 
 def computed(tag: Tag, sample_of: Callable[[Tag], Sample]) -> Sample:
-    """Returns the sample of a computed tag. It is bad if an input is bad.
+    """Returns the sample of a computed tag. It is bad, or uncertain, if an input is.
 
     Its time is that of the newest input: a value that follows from another is never older.
     """
     inputs = [sample_of(one) for one in tag.origin.inputs]
     for sample in inputs:
         if sample.quality is Quality.BAD:
-            name = sample.tag.name if sample.tag.device == tag.device else sample.tag.key
-            why = f"input {name} is bad"
-            detail = f"{why}: {sample.detail}" if sample.detail else why
-            return bad(tag, sample.reason or Reason.NOT_A_NUMBER, sample.time, detail)
+            return bad(tag, sample.reason or Reason.NOT_A_NUMBER, sample.time, _why(tag, sample))
     time = max(sample.time for sample in inputs)
     try:
-        value = tag.convert([sample.value for sample in inputs])
+        found = converted(tag, [sample.value for sample in inputs], time)
     except ArithmeticError as error:
         return bad(tag, Reason.NOT_A_NUMBER, time, str(error))
-    return bad(tag, Reason.NOT_A_NUMBER, time) if value is None else good(tag, value, time)
+    doubtful = next((one for one in inputs if one.quality is Quality.UNCERTAIN), None)
+    if doubtful is None or found.quality is Quality.BAD:
+        return found
+    return uncertain(found, _why(tag, doubtful))
+
+
+def _why(tag: Tag, given: Sample) -> str:
+    name = given.tag.name if given.tag.device == tag.device else given.tag.key
+    why = f"input {name} is {given.quality}"
+    return f"{why}: {given.detail}" if given.detail else why
 
 
 class Dependents:

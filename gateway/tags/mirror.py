@@ -203,6 +203,8 @@ class Mirror:
         changed: Sequence[int] = ()
         if scan.values is not before.values:
             changed = list(compress(count(), map(ne, scan.values, before.values)))
+        if scan.outside != before.outside:
+            changed = sorted({*changed, *(scan.outside ^ before.outside)})
         if latest.by_rule:
             changed = self._due(latest, before, changed)
         return Samples(scan, changed) if changed else ()

@@ -2,7 +2,7 @@
 
 import math
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gateway.errors import Garbled
 from gateway.tags.tag import OriginWord, Tag
@@ -11,11 +11,12 @@ from gateway.values import Value
 
 class Quality(StrEnum):
     GOOD = "good"
+    UNCERTAIN = "uncertain"  # read well, but the sensor may not measure
     BAD = "bad"
 
 
 class Reason(StrEnum):
-    """The cause of a bad sample."""
+    """The cause of a sample that is not good. Only `out-of-range` has a value."""
 
     STARTING = "starting"  # not read yet
     NO_REPLY = "no-reply"  # the device does not reply
@@ -26,6 +27,7 @@ class Reason(StrEnum):
     DISABLED = "disabled"  # `enabled: false` in the file
     NOT_A_NUMBER = "not-a-number"  # a good read, but no value of the tag's type (NaN, bad BCD)
     WRONG_DEVICE = "wrong-device"  # the device that replies is not the one of the file
+    OUT_OF_RANGE = "out-of-range"  # the value is outside the range of its sensor
 
 
 class Sample(NamedTuple):
@@ -46,12 +48,25 @@ def good(tag: Tag, value: Value, time: int) -> Sample:
     return Sample(tag, value, Quality.GOOD, time)
 
 
+def uncertain(sample: Sample, detail: str = "") -> Sample:
+    """Returns the good sample as one whose sensor may not measure."""
+    return sample._replace(quality=Quality.UNCERTAIN, reason=Reason.OUT_OF_RANGE, detail=detail)
+
+
+def converted(tag: Tag, key: Any, time: int) -> Sample:
+    """Returns the sample for what `tag.convert` takes."""
+    value = tag.convert(key)
+    if value is None:
+        return bad(tag, Reason.NOT_A_NUMBER, time)
+    found, is_outside = good(tag, value, time), tag.range_check()
+    return found if is_outside is None or not is_outside(key) else uncertain(found)
+
+
 def of_field(tag: Tag, value: Value | Garbled, time: int) -> Sample:
     """Returns the sample for a field of a frame: its value, or the error that replaced it."""
     if isinstance(value, Garbled):
         return bad(tag, Reason.GARBLED, time, str(value))
-    known = tag.decode([value])
-    return bad(tag, Reason.NOT_A_NUMBER, time) if known is None else good(tag, known, time)
+    return converted(tag, value, time)
 
 
 def bad(tag: Tag, reason: Reason, time: int, detail: str = "") -> Sample:
@@ -70,8 +85,11 @@ class WriteResult(NamedTuple):
     origin: OriginWord | None = None  # simulated: no real device holds the value
 
 
+def has_json(value: Value | None) -> bool:
+    """JSON has no NaN and no infinity: they must not become a good null."""
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
 def has_value(sample: Sample) -> bool:
     """True if the sample is good, and a value that JSON has."""
-    value = sample.value
-    is_known = sample.quality is Quality.GOOD and value is not None
-    return is_known and not (isinstance(value, float) and not math.isfinite(value))
+    return sample.quality is Quality.GOOD and has_json(sample.value)

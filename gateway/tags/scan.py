@@ -7,12 +7,13 @@ from typing import Any, overload
 
 from gateway.tags.alarm import AlarmRule
 from gateway.tags.publishing import Publish
-from gateway.tags.sample import Quality, Reason, Sample, bad, of_field
+from gateway.tags.sample import Quality, Reason, Sample, bad, of_field, uncertain
 from gateway.tags.tag import Tag
 from gateway.values import Value
 
 Failures = Mapping[int, Sample]  # bad samples by place: the units there hold no value
 NO_FAILURES: Failures = {}
+_NOWHERE = frozenset[int]()
 
 
 class Latest:
@@ -47,11 +48,12 @@ class Latest:
 class Samples(Sequence[Sample]):
     """The samples of some places of a read. They are made when the first one is taken."""
 
-    __slots__ = ("_failures", "_made", "_places", "_tags", "_time", "_values")
+    __slots__ = ("_failures", "_made", "_outside", "_places", "_tags", "_time", "_values")
 
     def __init__(self, scan: "Scan", places: Sequence[int]) -> None:
         self._tags, self._values, self._failures = scan.tags, scan.values, scan.failures
         self._time = scan.time  # an equal read moves that of the scan
+        self._outside = scan.outside
         self._places = places
         self._made: list[Sample] | None = None
 
@@ -78,6 +80,11 @@ class Samples(Sequence[Sample]):
                 else new(Sample, (tags[place], value, good, time, None, ""))
                 for place in self._places
             ]
+            if self._outside:
+                self._made = [
+                    uncertain(sample) if place in self._outside else sample
+                    for place, sample in zip(self._places, self._made, strict=True)
+                ]
         return self._made
 
 
@@ -85,10 +92,10 @@ class Scan(Sequence[Sample]):
     """One read of a block: a value for each tag, and one time.
 
     `time` (nanoseconds since 1970) is the latest read; a read of equal units only moves it. A bad
-    sample keeps the time when it became bad.
+    sample keeps the time when it became bad. `outside`: the places of uncertain values.
     """
 
-    __slots__ = ("failures", "keys", "latest", "tags", "time", "units", "values")
+    __slots__ = ("failures", "keys", "latest", "outside", "tags", "time", "units", "values")
 
     def __init__(
         self,
@@ -108,6 +115,7 @@ class Scan(Sequence[Sample]):
         self.failures = failures
         self.time = time
         self.latest = latest
+        self.outside = _NOWHERE
 
     def __len__(self) -> int:
         return len(self.tags)
@@ -125,13 +133,14 @@ class Scan(Sequence[Sample]):
         value = self.values[index]
         if value is None:
             return self.failures[index]
-        return Sample(self.tags[index], value, Quality.GOOD, self.time)
+        sample = Sample(self.tags[index], value, Quality.GOOD, self.time)
+        return uncertain(sample) if index in self.outside else sample
 
 
 class Decoder:
     """Makes the scans of one block."""
 
-    __slots__ = ("_begins", "_convert", "_keys", "_places", "_tags")
+    __slots__ = ("_begins", "_checks", "_convert", "_keys", "_places", "_tags")
 
     def __init__(self, tags: Sequence[Tag], begins: Sequence[int]) -> None:
         """`begins`: for each tag the place of its first unit in the reply."""
@@ -139,6 +148,8 @@ class Decoder:
         self._begins = begins
         self._places = range(len(tags))
         self._convert = tuple(tag.convert for tag in tags)
+        checks = ((place, tag.range_check()) for place, tag in enumerate(tags))
+        self._checks = [(place, check) for place, check in checks if check is not None]
         self._keys = itemgetter(
             *(
                 begin if tag.single else slice(begin, begin + tag.span.size)
@@ -152,7 +163,7 @@ class Decoder:
         keys = self._keys(units)
         values = list(map(call, self._convert, keys))
         failures = self._failures(values, NO_FAILURES, time)
-        return Scan(self._tags, units, keys, values, failures, time, Latest())
+        return self._checked(Scan(self._tags, units, keys, values, failures, time, Latest()))
 
     def after(self, before: Scan, units: Sequence[Any], time: int) -> Scan:
         """Decodes the units that are not those of the read before."""
@@ -168,12 +179,20 @@ class Decoder:
                 values[place] = value
         if failures or None in new:
             failures = self._failures(values, failures, time)
-        return Scan(self._tags, units, keys, values, failures, time, before.latest)
+        scan = Scan(self._tags, units, keys, values, failures, time, before.latest)
+        return self._checked(scan)
 
     def fields(self, units: Sequence[Any], time: int) -> list[Sample]:
         """Returns the samples of a frame: its fields are values, not words."""
         parts = zip(self._tags, self._begins, strict=True)
         return [of_field(tag, units[begin], time) for tag, begin in parts]
+
+    def _checked(self, scan: Scan) -> Scan:
+        if self._checks:
+            keys = scan.keys
+            outside = (place for place, is_outside in self._checks if is_outside(keys[place]))
+            scan.outside = frozenset(outside)
+        return scan
 
     def _failures(self, values: Sequence[Value | None], before: Failures, time: int) -> Failures:
         """Returns a bad sample for each place without a value. One that is bad already stays."""

@@ -18,6 +18,16 @@ class Bounds(NamedTuple):
     low: float | None = None
     high: float | None = None
 
+    def exclude(self, value: Value | None) -> bool:
+        """Returns True if the number, or an element of the array, is outside."""
+        match value:
+            case None | str() | bool():
+                return False
+            case tuple():
+                return any(map(self.exclude, value))
+        low, high = self
+        return (low is not None and value < low) or (high is not None and value > high)
+
 
 @dataclass(frozen=True, slots=True)
 class Names:
@@ -53,6 +63,7 @@ class Shaping:
     ends: Ends | None = None  # instead of scale and offset
     decimals: int | None = None
     clamp: Bounds | None = None
+    range: Bounds | None = None  # of the sensor: a value outside is uncertain
     invert: bool = False  # of a bit
     names: Names | None = None
 
@@ -87,10 +98,8 @@ class Shaping:
 
     def check(self, value: Scalar) -> None:
         """Raises `BadValue` for a value that no read would show, because of the clamp."""
-        if self.clamp is None or isinstance(value, (bool, str)):
-            return
-        low, high = self.clamp
-        if (low is not None and value < low) or (high is not None and value > high):
+        if self.clamp is not None and self.clamp.exclude(value):
+            low, high = self.clamp
             raise BadValue(f"{value} is outside the clamp: {low} to {high}")
 
 

@@ -1,6 +1,6 @@
 """Tags: their addresses and rules, and the conversion between units and values."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -118,7 +118,7 @@ class Tag:
 
     def _decoder(self, shaping: Shaping) -> Decode:
         if self.element is not None:
-            return array_decoder(self.element.convert, self.element.span.size)
+            return array_decoder(self.element._decoder(shaping), self.element.span.size)
         origin = self.origin
         if origin.formula is not None:
             return with_shaping(origin.formula.value, shaping)
@@ -180,6 +180,16 @@ class Tag:
     def decode(self, units: Sequence[Any]) -> Value | None:
         """Returns the value of the units of the span; None: they hold none."""
         return self.convert(units[0] if self.single else units)
+
+    def range_check(self) -> Callable[[Any], bool] | None:
+        """Returns the function that finds a value outside the range of its sensor in what `convert`
+        takes, also where the clamp hides it; None: each value is inside."""
+        bounds = self.shaping.range
+        if bounds is None:
+            return None
+        hides = self.shaping.clamp is not None
+        convert = self._decoder(replace(self.shaping, clamp=None)) if hides else self.convert
+        return lambda key: bounds.exclude(convert(key))
 
     @property
     def key(self) -> str:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from gateway.errors import NothingToAcknowledge
 from gateway.parts.alarms.machine import IN_ALARM, TRANSITIONS, Alarm, Event, State, Status
-from gateway.tags import AlarmRule, Level
+from gateway.tags import AlarmRule, Level, Quality
 
 HIGH, LOW, HYSTERESIS = 80.0, 10.0, 5.0
 ON_HIGH = AlarmRule({Level.HIGH: HIGH})
@@ -43,6 +43,11 @@ class Driven:
     def good(self, value: float | bool, after: float = 1.0) -> State:
         self.wait(after)
         self._note(self.alarm.judge(value, self.now, self.time))
+        return self.state()
+
+    def uncertain(self, value: float, after: float = 1.0) -> State:
+        self.wait(after)
+        self._note(self.alarm.judge(value, self.now, self.time, Quality.UNCERTAIN))
         return self.state()
 
     def bad(self, after: float = 1.0) -> State:
@@ -158,7 +163,31 @@ def test_a_bad_value_clears_no_alarm() -> None:
     assert alarm.bad() is State.ACTIVE
     alarm.acknowledge()
     assert alarm.bad(after=1000.0) is State.ACKNOWLEDGED
-    assert not alarm.alarm.good
+    assert alarm.alarm.quality is Quality.BAD
+
+
+def test_an_uncertain_value_raises_an_alarm_and_ends_none() -> None:
+    alarm = Driven(AlarmRule({Level.HIGH: HIGH, Level.LOW: LOW}))
+    assert alarm.good(50) is State.NORMAL
+    assert alarm.uncertain(103) is State.ACTIVE  # beyond what the sensor measures
+    assert alarm.level() is Level.HIGH
+    assert alarm.uncertain(50) is State.ACTIVE
+    assert alarm.good(50) is State.RETURNED
+    assert alarm.uncertain(-25) is State.ACTIVE  # a broken wire
+    assert alarm.level() is Level.LOW
+
+
+def test_the_delay_of_an_alarm_stands_still_while_an_uncertain_value_is_below() -> None:
+    alarm = Driven(AlarmRule({Level.HIGH: HIGH}, delay=5.0))
+    alarm.good(85)
+    alarm.uncertain(-25, after=3.0)
+    alarm.wait(100.0)
+    assert alarm.state() is State.NORMAL
+    alarm.uncertain(103)
+    alarm.wait(1.9)
+    assert alarm.state() is State.NORMAL
+    alarm.wait(0.1)
+    assert alarm.state() is State.ACTIVE
 
 
 def test_nothing_to_acknowledge_is_said() -> None:

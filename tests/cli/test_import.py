@@ -253,7 +253,8 @@ lines:
         station: 1
         tags:
           speed: {address: D100, scale: 0.1, offset: -5, unit: rpm, every: 500ms, deadband: 2%}
-          level: {address: D10, type: float32, word_order: high_first, history: true}
+          level: {address: D10, type: float32, word_order: high_first, history: true,
+            clamp: [0, 1000], range: [null, 900]}
           text: {address: D600, type: "string[16]", byte_order: high_first, every: 15s}
           door: {address: M12, description: "Door; \\"open\\"", heartbeat: 1min, publish: always}
           batches: {address: C200, description: "=cmd|' /C calc'!A0", unit: "-"}

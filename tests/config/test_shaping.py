@@ -205,11 +205,13 @@ def test_meta_tells_the_type_of_the_value_and_that_of_the_device(
 
 
 def test_meta_has_the_shaping() -> None:
-    described: dict[str, Any] = meta_fields(only(f"{LEVEL}, decimals: 1, clamp: [0, 100]"))
+    shaping = f"{LEVEL}, decimals: 1, clamp: [0, 100], range: [-1.25, null]"
+    described: dict[str, Any] = meta_fields(only(shaping))
     assert described["from"] == (4000, 20000)
     assert described["to"] == (0, 100)
     assert described["decimals"] == 1
     assert described["clamp"] == {"min": 0, "max": 100}
+    assert described["range"] == {"min": -1.25, "max": None}
     assert meta_fields(only(MODE))["enum"] == {"0": "off", "1": "auto", "2": "manual"}
 
 
@@ -249,6 +251,15 @@ MISTAKES = [
     ("D1, scale: 0.01, decimals: 1, clamp: [0.25, 7]",
      "clamp: 0.25 is no limit here: the values have 1 decimals"),
     ("D1, clamp: [7, 0]", "clamp: 7 is not below 0: write [0, 100]"),
+    ("D1, range: [20, 4]", "range: 20 is not below 4: write [0, 100]"),
+    ("D1, range: 4..20",
+     "range: '4..20': write the least and the greatest value, such as [0, 100] or [0, null]"),
+    ("D1, range: [null, null]",
+     "range: write a least or a greatest value, such as [0, null]"),
+    ("M1, range: [0, 1]", "range: a bool has no range: only numbers have"),
+    ('D1, type: "string[4]", range: [0, 1]',
+     "range: a string[4] has no range: only numbers have"),
+    ("D1, counter: true, range: [0, 1]", "range: a total has no range: no sensor measures it"),
     ("D1, clamp: 7",
      "clamp: 7: write the least and the greatest value, such as [0, 100] or [0, null]"),
     ("D1, decimals: 1",

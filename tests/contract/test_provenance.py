@@ -17,9 +17,11 @@ from gateway.contract import payload
 from gateway.contract.documents.catalogue import REASONS
 from gateway.contract.meta import meta_fields
 from gateway.contract.past import buckets
-from gateway.contract.past.buckets import Bucket
+from gateway.contract.past.buckets import Now
+from gateway.contract.past.question import Question
 from gateway.tags import Reason, Tag, bad, good
-from tests.history.recorded import EVERYTHING, NOON, history
+from gateway.tags.sample import converted
+from tests.history.recorded import EVERYTHING, NOON, SECOND, history
 
 ROOT = Path(__file__).parents[2]
 BRIDGES = ROOT / "examples" / "bridges"
@@ -43,6 +45,7 @@ lines:
           plain: {address: D1}
           computed: {computed: plain * 2}
           clamped: {address: D2, clamp: [0, 100]}
+          ranged: {address: D2, range: [0, 50]}
           half: {address: D3, clamp: [null, 100]}
           steps: {address: "D4", type: "int16[2]", clamp: [0, 100]}
 """
@@ -68,12 +71,13 @@ def bridges(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
 
 def shown(tag: Tag, value: int, folder: Path, bridges: dict[str, Any]) -> dict[str, str]:
     """What the ways show beside the value, as the page has it."""
-    sample = good(tag, value, NOON)
+    sample = good(tag, value, NOON) if tag.origin.inputs else converted(tag, value, NOON)
     with history(folder / f"{tag.name}.db") as historian:
         historian.record([sample])
         [past] = historian.samples(tag, EVERYTHING, None)
+        asked, now = Question(EVERYTHING, bucket=SECOND), Now(NOON + 1, is_valid=True)
+        [bucket] = historian.buckets(tag, asked, now, lambda: None)
     known = json.loads(payload.value(sample))
-    bucket = Bucket(NOON, NOON, NOON + 1, 1, 1, 0, 1, 1, 1.0, 1, None)
     table = table_of([row_of(sample)], {})
     [quality] = table.columns[3].cells
     names = [column.name for column in _SAMPLES]
@@ -89,28 +93,31 @@ def shown(tag: Tag, value: int, folder: Path, bridges: dict[str, Any]) -> dict[s
         "InfluxDB": ", ".join(
             part.replace('"', "").replace("=", ": ")
             for part in re.split("[ ,]", bridges["influx"].line_of(tag.key, known))
-            if part.startswith(("origin", "limited"))
+            if part.startswith(("origin", "limited", "good=false"))
         ),
     }
 
 
 def _of_opcua(opcua: Any, tag: Tag, known: dict[str, Any]) -> str:
     code = opcua.data_value(known, opcua.type_of(meta_fields(tag))).StatusCode.value
-    names = {opcua.Code.Good: "Good", opcua.Code.GoodEdited: "GoodEdited"}
+    names = {
+        getattr(opcua.Code, name): name
+        for name in ("Good", "GoodEdited", "UncertainEngineeringUnitsExceeded")
+    }
     bits = {0: "", 0x500: ", limit bits low", 0x600: ", limit bits high"}
     return names[code & 0xFFFF0000] + bits[code & 0xFFFF]
 
 
 def _about(document: dict[str, Any]) -> str:
-    return ", ".join(
-        f"{name}: {document[name]}" for name in ("origin", "limited") if document.get(name)
-    )
+    found = [f"{name}: {document[name]}" for name in ("origin", "limited") if document.get(name)]
+    quality = document.get("quality", "good")
+    return ", ".join(found if quality == "good" else [*found, quality])
 
 
 def test_the_table_of_the_page_is_what_each_way_shows(
     tags: dict[str, Tag], tmp_path: Path, bridges: dict[str, Any]
 ) -> None:
-    cases = {"plain": 7, "simulated": 7, "computed": 7, "clamped": 100}
+    cases = {"plain": 7, "simulated": 7, "computed": 7, "clamped": 100, "ranged": 51}
     found = {name: shown(tags[name], value, tmp_path, bridges) for name, value in cases.items()}
     rows = [
         f"| {way} | {' | '.join(found[name][way] or '–' for name in cases)} |"
@@ -122,6 +129,8 @@ def test_the_table_of_the_page_is_what_each_way_shows(
     assert table.partition("\n\n")[0].splitlines() == rows
     marked = {way for way, text in found["simulated"].items() if text not in ("", "good", "Good")}
     assert marked == set(found["simulated"])
+    silent = {way for way, text in found["ranged"].items() if text in ("", "good", "Good")}
+    assert silent == {"`@meta`"}
 
 
 @pytest.mark.parametrize(
@@ -149,6 +158,12 @@ def test_a_read_outside_of_the_clamp_is_limited(tags: dict[str, Tag]) -> None:
         known = tags["clamped"].decode([word])
         assert known == value
         assert tags["clamped"].shaping.limited(known) == limited
+
+
+def test_a_bridge_takes_an_uncertain_value_only_with_its_reason(bridges: dict[str, Any]) -> None:
+    known = {"value": 7, "quality": "uncertain", "time": "2026-11-20T12:00:00Z"}
+    is_value = sys.modules["gateway_values"].is_value
+    assert [is_value(known | more) for more in ({}, {"reason": "out-of-range"})] == [False, True]
 
 
 def test_a_bad_value_is_not_limited(tags: dict[str, Tag]) -> None:

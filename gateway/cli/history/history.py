@@ -25,7 +25,7 @@ from gateway.parts.history.files.offline import salvage as salvaged
 from gateway.parts.history.settings import HistorySection
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.tags.recorded import RecordedQuery
-from gateway.tags.sample import has_value
+from gateway.tags.sample import has_json, has_value
 
 cli = typer.Typer(help="Recorded samples.", no_args_is_help=True)
 
@@ -145,12 +145,13 @@ def _samples(
 
 def _row(sample: Sample) -> tuple[Any, ...]:
     tag, value = sample.tag, sample.value
-    if has_value(sample):
-        more = tag.origin.word, tag.shaping.limited(value)
-        return sample.time, tag.key, value, "good", None, *more
-    reason = Reason.NOT_A_NUMBER if sample.quality is Quality.GOOD else sample.reason
-    known = None if reason is None else reason.value
-    return sample.time, tag.key, None, "bad", known, tag.origin.word, None
+    reason = None if sample.reason is None else sample.reason.value
+    if sample.quality is Quality.BAD or not has_json(value):
+        if sample.quality is not Quality.BAD:
+            reason = Reason.NOT_A_NUMBER.value
+        return sample.time, tag.key, None, "bad", reason, tag.origin.word, None
+    more = tag.origin.word, tag.shaping.limited(value)
+    return sample.time, tag.key, value, sample.quality.value, reason, *more
 
 
 def _buckets(

@@ -24,7 +24,7 @@ from gateway.values import BYTES, Kind
 
 _FIRST = ("Device", "Name", "Address", "Type", "Unit", "Scale", "Offset", "Every", "R/W")
 _OWN = {"type", "raw_type", "address", "unit", "scale", "offset", "every", "write", "deadband"}
-_OWN |= {"clamp", "enum", "counter", "length"}
+_OWN |= {"clamp", "range", "enum", "counter", "length"}
 _TIMES = {"every", "heartbeat", "debounce"}
 
 
@@ -93,8 +93,9 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
         else "",
     }
     row |= _order(tag)
-    if tag.shaping is not None and tag.shaping.clamp is not None:
-        row["Clamp"] = orjson.dumps([*tag.shaping.clamp]).decode()
+    for title, bounds in (("Clamp", tag.shaping.clamp), ("Range", tag.shaping.range)):
+        if bounds is not None:
+            row[title] = orjson.dumps([*bounds]).decode()
     if isinstance(tag.origin.kept, CounterRule):
         row["Counter"] = _counter(tag.origin.kept)
     if tag.shaping.names is not None:

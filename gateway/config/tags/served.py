@@ -130,12 +130,14 @@ class ServedDevice:
         own = self._own(tag.name)
         place = ("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
+        for setting in ("debounce", "counter", "range"):
+            if own.get(setting):
+                text = f"{setting} is for values that the gateway reads: remove it here"
+                self._note((*place, setting), text)
         if tag.origin.kept is not None:
-            for setting in ("debounce", "counter"):
-                if setting in own:
-                    text = f"{setting} is for values that the gateway reads: remove it here"
-                    self._note((*place, setting), text)
             tag = replace(tag, origin=tag.origin.inputs[0].origin)
+        if tag.shaping.range is not None:
+            tag = replace(tag, shaping=replace(tag.shaping, range=None))
         hold_last = own.get("hold_last", self.defaults.hold_last) is True
         inside = [served.takes(*cell) for cell in cells_of(tag.span)]
         accepted = any(inside)

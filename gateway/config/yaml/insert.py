@@ -53,7 +53,9 @@ def flow(value: object) -> str:
     """Returns data as YAML in one line."""
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{written(k)}: {flow(v)}' for k, v in value.items())}}}"
-    return written(value)
+    if isinstance(value, list):
+        return f"[{', '.join(map(flow, value))}]"
+    return "null" if value is None else written(value)
 
 
 def written(value: object) -> str:

@@ -29,7 +29,8 @@ class Kind(NamedTuple):
 
 _TAG = "{device}/{tag}"
 _OWN = "@gateway/{gateway}"
-REASONS = {  # of bad values: the status codes of OPC UA, and the status signals of NAMUR NE 107
+# Of values that are not good: the status codes of OPC UA, and the status signals of NAMUR NE 107.
+REASONS = {
     Reason.STARTING: ("BadWaitingForInitialData", "C"),
     Reason.NO_REPLY: ("BadDeviceFailure", "F"),
     Reason.GARBLED: ("BadCommunicationError", "F"),
@@ -39,6 +40,7 @@ REASONS = {  # of bad values: the status codes of OPC UA, and the status signals
     Reason.DISABLED: ("BadOutOfService", "C"),
     Reason.NOT_A_NUMBER: ("BadSensorFailure", "F"),
     Reason.WRONG_DEVICE: ("BadConfigurationError", "F"),
+    Reason.OUT_OF_RANGE: ("UncertainEngineeringUnitsExceeded", "S"),
 }
 _STATE: dict[str, Any] = {  # by path
     "status": state.StatusDocument,

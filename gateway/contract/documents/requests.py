@@ -106,7 +106,7 @@ class AlarmDocument(TypedDict):
     level: Annotated[Level, words(*Level)] | None
     limit: float | bool | None
     value: Value | None
-    quality: Literal["good", "bad"]
+    quality: Literal["good", "uncertain", "bad"]
     time: NotRequired[Time]
     text: str
     reason: NotRequired[Why]

@@ -43,6 +43,19 @@ class KnownValue(TypedDict):
     limited: NotRequired[Limited]  # at this end of its clamp: the device may be beyond
 
 
+class UncertainValue(TypedDict):
+    """A value as the device had it at `time`, which is outside the range of its sensor."""
+
+    value: Value
+    quality: Literal["uncertain"]
+    reason: Why
+    time: Time
+    detail: NotRequired[str]  # for people: its words may change
+    text: NotRequired[str]
+    origin: NotRequired[Origin]
+    limited: NotRequired[Limited]
+
+
 class UnknownValue(TypedDict):
     """The reason why there is no value, since `time`."""
 
@@ -54,7 +67,7 @@ class UnknownValue(TypedDict):
     origin: NotRequired[Origin]
 
 
-ValueDocument = KnownValue | UnknownValue
+ValueDocument = KnownValue | UncertainValue | UnknownValue
 BlockDocument = dict[str, ValueDocument]  # by tag
 
 
@@ -67,9 +80,9 @@ class PlaceDocument(TypedDict):
 
 
 class WithoutValue(TypedDict):
-    """The attachment of a value with `payload: raw`; `reason` if it is bad."""
+    """The attachment of a value with `payload: raw`; `reason` if it is not good."""
 
-    quality: Literal["good", "bad"]
+    quality: Literal["good", "uncertain", "bad"]
     time: Time
     reason: NotRequired[Why]
     detail: NotRequired[str]
@@ -117,6 +130,7 @@ class MetaDocument(_Ends):
     offset: float
     decimals: int | None
     clamp: Limits | None
+    range: Limits | None
     invert: bool
     enum: dict[str, str] | None
     debounce: float | None

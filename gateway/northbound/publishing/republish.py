@@ -148,7 +148,7 @@ class Republisher:
             if self._plant.tag(tag.key) is not tag:
                 continue
             sample = self._plant.sample(tag)
-            if sample.quality is Quality.GOOD:
+            if sample.quality is not Quality.BAD:
                 published_at.pop(tag, None)
             elif now - published_at.setdefault(tag, now) >= (tag.publishing.heartbeat or 0.0):
                 published_at[tag] = now

@@ -26,6 +26,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
 # line that is back reply one after the other.
 OWN_AFTER = 10.0
 _UNKNOWN = Reading(None)
+_GOOD, _UNCERTAIN = Quality.GOOD, Quality.UNCERTAIN  # looking up a member takes 0.2 µs
 
 
 @dataclass(slots=True, eq=False)
@@ -152,20 +153,21 @@ class Alarms:
         if type(samples) is Scan and samples.latest.alarmed is not None:
             tags, values = samples.tags, samples.values
             for place in samples.latest.alarmed:
-                self._apply(self._by_tag[tags[place]], values[place], samples.time)
+                quality = _UNCERTAIN if place in samples.outside else _GOOD
+                self._apply(self._by_tag[tags[place]], values[place], quality, samples.time)
             return
         for sample in samples:
             if sample.tag.feature(AlarmRule) is not None:
-                known = sample.value if sample.quality is Quality.GOOD else None
-                self._apply(self._by_tag[sample.tag], known, sample.time)
+                known = None if sample.quality is Quality.BAD else sample.value
+                self._apply(self._by_tag[sample.tag], known, sample.quality, sample.time)
 
-    def _apply(self, entry: Entry, value: Value | None, at: int) -> None:
+    def _apply(self, entry: Entry, value: Value | None, quality: Quality, at: int) -> None:
         """Applies a value; None: it is bad."""
         alarm = entry.alarm
-        was_good = alarm.good
-        if value is None and not was_good:
+        before = alarm.quality
+        if value is None and before is Quality.BAD:
             return
-        if value is not None and was_good and value == alarm.value:
+        if value is not None and quality is before and value == alarm.value:
             return  # the timer ends a delay
         now = asyncio.get_running_loop().time()
         if (event := alarm.elapse(now, at)) is not None:
@@ -174,8 +176,8 @@ class Alarms:
         if value is None:
             alarm.suspend(now)
         else:
-            event = alarm.judge(value, now, at)
-        if event is not None or alarm.good is not was_good:
+            event = alarm.judge(value, now, at, quality)
+        if event is not None or alarm.quality is not before:
             self._report(entry, event)
         self._set_timer(entry)
 
@@ -285,7 +287,7 @@ class Alarms:
         if entry.look is not None:
             before = entry.part_of, entry.status.folded
             entry.reading = entry.look()
-            self._apply(entry, entry.reading.alarm, self._wall())
+            self._apply(entry, entry.reading.alarm, _GOOD, self._wall())
             self._fold(entry)
             if before != (entry.part_of, entry.status.folded):
                 self._count(entry)

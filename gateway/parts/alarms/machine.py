@@ -1,7 +1,8 @@
 """One alarm: a state machine after ISA-18.2. It does no I/O and has no clock.
 
-Only a good value changes what the limits say. A bad value holds everything: an alarm neither comes
-nor goes by it, and the time of a delay stands still.
+A bad value holds everything: an alarm neither comes nor goes by it, and the time of a delay stands
+still. An uncertain value can raise an alarm, because the plant may be beyond what the sensor can
+measure. It ends none, because the sensor may be broken.
 """
 
 from collections.abc import Mapping
@@ -9,6 +10,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from gateway.errors import NothingToAcknowledge
+from gateway.tags import Quality
 from gateway.tags.alarm import BELOW, AlarmRule, Level
 from gateway.values import Value
 from gateway.values.numerals import are_apart
@@ -100,9 +102,12 @@ class _Condition:
             return None
         return self._since + self._delay - self._waited
 
-    def judge(self, value: float, now: float) -> None:
+    def judge(self, value: float, now: float, *, certain: bool) -> None:
         value *= self._sign
         is_below = value < self._limit
+        if is_below and not certain:
+            self.suspend(now)
+            return
         if is_below and (self._waited is None or are_apart(self._limit, value, self._hysteresis)):
             self._waited = self._since = None
             self.active = False
@@ -132,14 +137,14 @@ class _Condition:
 class Alarm:
     """The alarm of one value. `now`: seconds of a steady clock; `time`: ns since 1970."""
 
-    __slots__ = ("_conditions", "good", "is_part", "rule", "status", "value")
+    __slots__ = ("_conditions", "is_part", "quality", "rule", "status", "value")
 
     def __init__(self, rule: AlarmRule) -> None:
         self.rule = rule
         self.status = Status()
-        self.good = False  # the quality of the value
+        self.quality = Quality.BAD  # of the value
         self.is_part = False  # of another alarm: it is judged, and raises nothing
-        self.value: Value | None = None  # the last good one
+        self.value: Value | None = None  # the last one that was not bad
         worst_first = [level for level in Level if level in rule.limits]
         self._conditions = [_Condition(rule, level, rule.limits[level]) for level in worst_first]
 
@@ -148,18 +153,20 @@ class Alarm:
         """When `elapse` is to be called; None: not needed."""
         return min((one.due for one in self._conditions if one.due is not None), default=None)
 
-    def judge(self, value: Value, now: float, time: int) -> Event | None:
-        """Applies a good value. Call `elapse` with the same time before it."""
-        self.good, self.value = True, value
+    def judge(
+        self, value: Value, now: float, time: int, quality: Quality = Quality.GOOD
+    ) -> Event | None:
+        """Applies a good or uncertain value. Call `elapse` with the same time before it."""
+        self.quality, self.value = quality, value
         if isinstance(value, (str, tuple)):
             return None
         for condition in self._conditions:
-            condition.judge(value, now)
+            condition.judge(value, now, certain=quality is Quality.GOOD)
         return self.elapse(now, time)
 
     def suspend(self, now: float) -> None:
         """Applies a bad value: the alarm stays as it is."""
-        self.good = False
+        self.quality = Quality.BAD
         for condition in self._conditions:
             condition.suspend(now)
 

@@ -1,9 +1,9 @@
 """One transfer: which write is due, what it carries, and its state. No I/O, no clock.
 
-A row carries only a good value whose last read is younger than `stale`. It carries each value
-once: a write that may have been done is not repeated. At most one write is under way. A write lets
-the block of its target be read at once, which may hold the source: so the next change waits for the
-interval of the source.
+A row carries only a good value whose last read is younger than `stale`; none that is uncertain. It
+carries each value once: a write that may have been done is not repeated. At most one write is under
+way. A write lets the block of its target be read at once, which may hold the source: so the next
+change waits for the interval of the source.
 """
 
 import math
@@ -224,7 +224,8 @@ class Row:
         if source.value is not None:
             why = f"the last read of {name} is older than {self.rule.stale:g} s"
             return Verdict(State.STALE, Code.NO_RESPONSE, why)
-        why = f"{name} is bad: {source.reason}" if source.reason else f"{name} is bad"
+        quality = "uncertain" if source.reason is Reason.OUT_OF_RANGE else "bad"
+        why = f"{name} is {quality}: {source.reason}" if source.reason else f"{name} is bad"
         if source.detail:
             why += f" ({source.detail})"
         if self.last is None and source.reason is Reason.STARTING:

@@ -204,12 +204,10 @@ class Page:
             why: str = fields.get("origin") or ""
             if end := fields.get("limited"):
                 why = f"{why} limited {end}".strip()
-            good = fields["quality"] != "bad"
-            if fields["quality"] == "bad":
-                why = " ".join(filter(None, (fields["reason"], fields.get("detail"))))
-            found.append(
-                [tag.key, text if good else "", good, sample.time // 10**6, why, fields.get("text")]
-            )
+            if fields["quality"] != "good":
+                why = " ".join(filter(None, (fields["reason"], fields.get("detail"), why)))
+            text, at = "" if known is None else text, sample.time // 10**6
+            found.append([tag.key, text, fields["quality"], at, why, fields.get("text")])
         return found
 
 

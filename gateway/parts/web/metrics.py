@@ -201,10 +201,9 @@ def _qualities(plant: Plant, line_of: Mapping[str, str]) -> Metric:
     family = _family("device_tags", "Tags by quality", "line", "device", "quality")
     for device in plant.devices():
         qualities = [plant.sample(tag).quality for tag in device.tags]
-        good = qualities.count(Quality.GOOD)
         place = [line_of.get(device.name, ""), device.name]
-        family.add_metric([*place, "good"], good)
-        family.add_metric([*place, "bad"], len(qualities) - good)
+        for quality in Quality:
+            family.add_metric([*place, quality.value], qualities.count(quality))
     return family
 
 

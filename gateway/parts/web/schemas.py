@@ -43,7 +43,7 @@ def _both(name: str, **more: Schema) -> Schema:
 
 
 _NEXT = _about({"type": ["string", "null"]}, "`after` of the next page; null: this was the last")
-_SAMPLE: Schema = {"anyOf": [ref("KnownValue"), ref("UnknownValue")]}
+_SAMPLE: Schema = {"anyOf": [*map(ref, ("KnownValue", "UncertainValue", "UnknownValue"))]}
 _OF_ROUTES = ("DeviceDocument", "AlarmDocument", "AcknowledgeRequest", "WrittenDocument")
 _OWN: Mapping[str, Schema] = {
     "Error": _record({"error": TEXT}),
@@ -78,7 +78,7 @@ _OWN: Mapping[str, Schema] = {
             "MetaDocument",
             tag=_about(TEXT, "device/name"),
             value=_about({}, "null when bad"),
-            quality={"enum": ["good", "bad"]},
+            quality={"enum": ["good", "uncertain", "bad"]},
             time=_about(TEXT, "UTC"),
             alarm=_about({"type": ["object", "null"]}, "Its limits by level; null: it has none"),
         ),

@@ -81,7 +81,8 @@ def _counted(tag: Tag, rule: CounterSection) -> Tag:
     if rule.top is not None:
         modulus = rule.top + 1
     kept = CounterRule(modulus, modulus // 2 if rule.most is None else rule.most)
-    return _around(tag, Layout(ValueType(Kind.INT64)), kept, PLAIN)
+    shaping = replace(tag.shaping, range=None)
+    return _around(replace(tag, shaping=shaping), Layout(ValueType(Kind.INT64)), kept, PLAIN)
 
 
 def _check(own: Any, facts: Facts) -> Iterator[Problem]:
@@ -109,6 +110,8 @@ def _counter_misfits(own: Any, kind: ValueType) -> Iterator[Problem]:
         yield "counter", "bits and top say the same: remove one of them"
     if own.enum is not None:
         yield "enum", "a total has no names"
+    if "range" in own.model_fields_set:
+        yield "range", "a total has no range: no sensor measures it"
     if rule.top is not None and not kind.holds(rule.top):
         yield "counter", f"{rule.top} is no value of a {kind}"
     if rule.bits is not None and rule.bits > kind.bits:

@@ -37,6 +37,7 @@ _ENUM_SCHEMA = {
     "additionalProperties": {"type": "string"},
     "minProperties": 1,
 }
+_Bounds = Annotated[Bounds, Parsed(shaping_parsers.bounds, _CLAMP_SCHEMA)]
 _Pair = Annotated[tuple[float, float], Parsed(shaping_parsers.pair, _PAIR_SCHEMA)]
 
 
@@ -51,8 +52,10 @@ class ScalingSettings(Settings):
     """The values of the tag at the two ends of `from`, such as [0, 100]; instead of scale."""
     decimals: Annotated[int, Field(ge=0, le=15)] | None = None
     """A read is rounded to so many decimals, and so is a write."""
-    clamp: Annotated[Bounds | None, Parsed(shaping_parsers.clamp, _CLAMP_SCHEMA)] = None
+    clamp: _Bounds | None = None
     """A read outside is shown as the nearest end, such as [0, 100] or [0, null]."""
+    range: _Bounds | None = None
+    """What the sensor can measure: a read outside is uncertain, such as [0, 100] or [0, null]."""
 
     @model_validator(mode="after")
     def _both_ends(self) -> Self:
@@ -75,7 +78,8 @@ def _check(own: Any, facts: Facts) -> Iterator[Problem]:
     kind = facts.kind
     shaping, value_type = _shaping(own, facts)
     if facts.area is not None or facts.field is not None:
-        yield from for_numbers(own, kind, "scale", "offset", "from_", "decimals", "clamp")
+        numbers = ("scale", "offset", "from_", "decimals", "clamp", "range")
+        yield from for_numbers(own, kind, *numbers)
         yield from for_one(own, kind, "enum")
         if own.invert and kind.kind is not Kind.BOOL:
             yield (
@@ -126,7 +130,7 @@ def _shaping(own: Any, facts: Facts) -> tuple[Shaping, str]:
     settings, kind = facts.settings, facts.kind
     if facts.area is None and facts.field is None:  # of a computed tag
         decimals = None if facts.whole else settings.decimals
-        return Shaping(decimals=decimals, clamp=settings.clamp), str(kind)
+        return Shaping(decimals=decimals, clamp=settings.clamp, range=settings.range), str(kind)
     found, value_type = (
         (PLAIN, str(kind))
         if not kind.is_number
@@ -137,6 +141,7 @@ def _shaping(own: Any, facts: Facts) -> tuple[Shaping, str]:
             None if settings.to is None else Ends(settings.from_, settings.to),
             settings.decimals,
             settings.clamp,
+            settings.range,
         )
     )
     if own.invert or own.enum is not None:
@@ -152,6 +157,7 @@ def _of_number(
     ends: Ends | None,
     decimals: int | None,
     clamp: Bounds | None,
+    sensor: Bounds | None,
 ) -> tuple[Shaping, str]:
     """Returns one object for all that are equal."""
     value_type = type_of(kind, linear(scale, offset, ends))
@@ -161,6 +167,7 @@ def _of_number(
         ends=ends,
         decimals=decimals if value_type.startswith("float") else None,
         clamp=clamp,
+        range=sensor,
     )
     return PLAIN if found == PLAIN else found, value_type
 
@@ -175,7 +182,6 @@ def _make(own: Any, facts: Facts) -> Shaping:
 
 def _meta(tag: Tag) -> dict[str, object]:
     shaping = tag.shaping
-    low, high = shaping.clamp or Bounds()
     names = None if shaping.names is None else shaping.names.by_number
     return {
         "scale": shaping.scale,
@@ -183,16 +189,21 @@ def _meta(tag: Tag) -> dict[str, object]:
         "from": None if shaping.ends is None else shaping.ends.raw,
         "to": None if shaping.ends is None else shaping.ends.value,
         "decimals": shaping.decimals,
-        "clamp": None if shaping.clamp is None else {"min": low, "max": high},
+        "clamp": _limits(shaping.clamp),
+        "range": _limits(shaping.range),
         "invert": shaping.invert,
         "enum": None if names is None else {str(number): name for number, name in names.items()},
     }
 
 
+def _limits(bounds: Bounds | None) -> dict[str, float | None] | None:
+    return None if bounds is None else {"min": bounds.low, "max": bounds.high}
+
+
 FEATURE = Feature(
     defaults=ScalingSettings,
     own=ShapingSettings,
-    computed=frozenset({"decimals", "clamp"}),
+    computed=frozenset({"decimals", "clamp", "range"}),
     check=_check,
     make=_make,
     slot="shaping",

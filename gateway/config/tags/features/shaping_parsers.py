@@ -28,7 +28,7 @@ def pair(value: object) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def clamp(value: object) -> Bounds:
+def bounds(value: object) -> Bounds:
     """Parses `[0, 100]` and `[0, null]`."""
     ends = value if isinstance(value, list) and len(value) == 2 else []
     found = [_number(one) for one in ends]
@@ -38,7 +38,7 @@ def clamp(value: object) -> Bounds:
         )
     low, high = found
     if low is high is None:
-        raise ConfigError("a clamp needs a least or a greatest value, such as [0, null]")
+        raise ConfigError("write a least or a greatest value, such as [0, null]")
     if low is not None and high is not None and low >= high:
         raise ConfigError(f"{shown(low)} is not below {shown(high)}: write [0, 100]")
     return Bounds(low, high)

@@ -57,7 +57,8 @@ def from_row(tag: Tag, time: int, stored: Stored, kind: int | None, bad: str | N
     value = _value(stored, kind)
     if bad is None:
         return Sample(tag, value, Quality.GOOD, time)
-    return Sample(tag, value, Quality.BAD, time, _REASONS.get(bad))
+    quality = Quality.BAD if value is None else Quality.UNCERTAIN
+    return Sample(tag, value, quality, time, _REASONS.get(bad))
 
 
 def step(

@@ -139,7 +139,7 @@ on("values", (values) => {
   const keys = values.map(([key]) => key);
   if (begun && keys.join() !== shown.join()) load(); // the file was changed, or could not be read before
   begun = false;
-  for (const [key, text, good, time, why, name] of values) take(tagOf(key), { text, good, time, why, name });
+  for (const [key, text, quality, time, why, name] of values) take(tagOf(key), { text, quality, time, why, name });
   showAll();
 });
 on("tick", showAll);

@@ -56,19 +56,21 @@ export function written(tag, text) {
 export function shown(tag) {
   const { last, meta } = tag;
   if (!last) return ["", "", ""];
-  if (!last.good) return ["–", "", ""];
+  if (last.quality === "bad") return ["–", "", ""];
   const hex = /^-?\d+$/.test(last.text) && !/^string/.test(meta?.type ?? "") ? `${last.text} = 0x${BigInt(last.text).toString(16)}` : last.text;
   return [last.name ?? written(tag, last.text), last.name ? "" : (meta?.unit ?? ""), last.name ? `${last.name} (${last.text})` : hex];
 }
 
-const quality = ({ last }) => (!last ? "" : last.good ? last.why || "good" : `bad: ${last.why.split(": ")[0]}`);
+const quality = ({ last }) => (!last ? "" : last.good ? last.why || "good" : `${last.quality}: ${last.why.split(": ")[0]}`);
 
 export const age = ({ last }) => (last && now() ? span(Math.max(0, (now() - last.time) / 1000)) : "");
 
 export const title = ({ meta }) =>
   meta ? [meta.tag, meta.description, `${meta.type} at ${meta.address}`, `read every ${span(meta.every)}`].filter(Boolean).join("\n") : "";
 
+// `last`: text ("" if there is no value), quality, time, why, name.
 export function take(tag, last) {
+  last.good = last.quality === "good";
   tag.last = last;
   tag.current = true;
   const number = !last.good ? null : last.text === "true" ? 1 : last.text === "false" ? 0 : Number(last.text);
@@ -80,9 +82,9 @@ export function take(tag, last) {
 
 export function takeSample(found) {
   const tag = describe(found);
-  const why = found.quality === "good" ? found.origin : [found.reason, found.detail].filter(Boolean).join(" ");
-  const text = typeof found.value === "string" ? found.value : JSON.stringify(found.value);
-  take(tag, { text, good: found.quality === "good", time: Date.parse(found.time), why: why ?? "", name: found.text ?? null });
+  const why = [found.reason, found.detail, found.origin, found.limited && `limited ${found.limited}`].filter(Boolean).join(" ");
+  const text = found.value === null ? "" : typeof found.value === "string" ? found.value : JSON.stringify(found.value);
+  take(tag, { text, quality: found.quality, time: Date.parse(found.time), why, name: found.text ?? null });
   return tag;
 }
 
