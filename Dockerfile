@@ -5,10 +5,12 @@ FROM ${BASE} AS build
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY gateway gateway
+COPY packaging/sbom.cdx.json packaging/sbom.cdx.json
 RUN python -m venv /opt/gateway \
     && /opt/gateway/bin/pip install --no-cache-dir --require-hashes --requirement constraints.txt \
     && /opt/gateway/bin/pip install --no-cache-dir --no-deps --no-build-isolation . \
-    && /opt/gateway/bin/pip uninstall --yes setuptools
+    && /opt/gateway/bin/pip uninstall --yes \
+        hatchling packaging pathspec pluggy tomlkit trove-classifiers
 
 FROM ${BASE}
 # Serial ports belong to the group dialout: docker run --device /dev/ttyUSB0 --group-add dialout ...

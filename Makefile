@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -75,14 +75,49 @@ clean:
 	touch $@
 
 # Notes the hashes of all files of each package, for every system. `make pins NEW=--upgrade` also
-# takes newer versions.
-PINS = echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --quiet --universal $(NEW) \
-    --python-version 3.11 --generate-hashes --no-annotate --custom-compile-command 'make pins'
+# takes newer versions. `make sbom` follows.
+PINS = echo 'hatchling>=1.28' | $(BIN)/uv pip compile - --quiet --universal $(NEW) --no-header \
+    --python-version 3.11 --generate-hashes --no-annotate
+PINNED = '2i \# `make pins` makes this file from pyproject.toml; it keeps the versions that are here.'
 
 pins: .venv/ready
 	$(BIN)/pip install --quiet 'uv~=0.13'
-	$(PINS) --output-file constraints.txt
-	$(PINS) --output-file constraints-dev.txt --all-extras --constraint constraints.txt
+	$(PINS) --output-file constraints.txt pyproject.toml
+	$(PINS) --output-file constraints-dev.txt pyproject.toml --all-extras --constraint constraints.txt
+	$(PINS) --output-file constraints-release.txt --group release --constraint constraints-dev.txt
+	sed -i '1i # The packages that the gateway runs with, and hatchling to build it, each with the hashes of its files.' constraints.txt
+	sed -i '1i # The packages that developers and tests need, with those of constraints.txt, each with the hashes of its files.' constraints-dev.txt
+	sed -i '1i # The packages that build a release, each with the hashes of its files.' constraints-release.txt
+	sed -i $(PINNED) constraints.txt constraints-dev.txt constraints-release.txt
+
+# Programs that build a release; in a place of their own.
+build/tools/ready: constraints-release.txt
+	$(PYTHON) -m venv build/tools
+	build/tools/bin/pip install --quiet --upgrade pip
+	build/tools/bin/pip install --quiet --require-hashes --requirement constraints-release.txt
+	touch $@
+
+# The bill of materials that each wheel contains: the packages of constraints.txt, as they describe
+# themselves, without those that only build.
+BUILDERS = hatchling packaging pathspec pluggy tomlkit trove-classifiers
+INTO_SBOM = build/tools/bin/pip --python build/sbom/bin/python
+
+sbom: build/tools/ready
+	$(PYTHON) -m venv --clear --without-pip build/sbom
+	$(INTO_SBOM) install --quiet --require-hashes --requirement constraints.txt
+	$(INTO_SBOM) install --quiet --no-deps --no-build-isolation .
+	$(INTO_SBOM) uninstall --quiet --yes $(BUILDERS)
+	build/tools/bin/python -m tools.sbom build/sbom
+
+# Wheel, sdist, bill of materials and an archive for machines without a network: in dist/, built
+# twice from the last commit. Fails if a bit is different.
+release: build/tools/ready
+	build/tools/bin/python -m tools.release
+
+# The same with an archive for fewer machines: make bundle MACHINES=armv7l PYTHONS="3.11 3.13"
+bundle: build/tools/ready
+	build/tools/bin/python -m tools.release $(if $(MACHINES),--machines "$(MACHINES)") \
+	    $(if $(PYTHONS),--pythons "$(PYTHONS)")
 
 # Long proofs (docs/proof.md); a short slice of each runs with the tests.
 SEEDS ?= 0-19

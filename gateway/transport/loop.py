@@ -1,4 +1,4 @@
-"""Creates the event loop: uvloop's with an exact clock, or asyncio's own on Windows."""
+"""Creates the event loop: uvloop's with an exact clock, or asyncio's own where it has no wheel."""
 
 import asyncio
 import importlib

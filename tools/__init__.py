@@ -1,0 +1,1 @@
+"""Programs that build a release; no part of the gateway."""
