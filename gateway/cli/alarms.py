@@ -25,6 +25,7 @@ from gateway.cli.terminal import (
 from gateway.errors import ConfigError
 
 _ORDER = ("active", "returned", "acknowledged", "normal")
+_URGENT = ("critical", "high", "medium", "low")
 _STYLES = {"active": "red", "returned": "yellow", "acknowledged": "yellow"}
 _MISTAKES = ("bad-value", "unknown-tag")
 
@@ -77,8 +78,9 @@ def _known(path: Path) -> dict[str, None]:
 
 def _alarms(client: Client, *, every: bool) -> list[dict[str, Any]]:
     found = [one for one in client.alarms() if every or one["state"] != "normal"]
-    # Of one state the newest first.
+    # Of one state and priority the newest first.
     found.sort(key=lambda one: str(one["since"]), reverse=True)
+    found.sort(key=lambda one: _URGENT.index(one.get("priority", "medium")))
     return sorted(found, key=lambda one: _ORDER.index(one["state"]))
 
 
@@ -101,7 +103,16 @@ def view(found: Sequence[dict[str, Any]]) -> RenderableType:
     if not found:
         return Text("no alarms")
     table = Table(box=None, pad_edge=False)
-    for column in ("alarm", "state", "limit", "value", "since", "acknowledged by", "text"):
+    for column in (
+        "alarm",
+        "priority",
+        "state",
+        "limit",
+        "value",
+        "since",
+        "acknowledged by",
+        "text",
+    ):
         table.add_column(column)
     for one in found:
         limit = "" if one["limit"] in (None, True, False) else f" {one['limit']:g}"
@@ -110,6 +121,7 @@ def view(found: Sequence[dict[str, Any]]) -> RenderableType:
         texts = (one["text"], part or (one.get("detail", "") if one["value"] is True else ""))
         table.add_row(
             Text(printable(one["alarm"])),
+            Text(one.get("priority", "")),
             Text(one["state"], style=_STYLES.get(one["state"], "")),
             Text(f"{one['level'] or ''}{limit}"),
             Text(printable(_value(one)), style="" if one["quality"] == "good" else "red"),

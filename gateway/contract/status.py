@@ -24,7 +24,7 @@ from gateway.tags.timestamps import rfc3339
 
 MOST_REQUESTS = 200
 MOST_TOLD = 10  # texts of one name
-BACK = 10.0  # seconds that a device of a silent line replies before that line is no longer silent
+BACK = 5.0  # seconds that a device of a silent line replies before that line is no longer silent
 # The words of the status documents; users read them since the first version.
 _STANDING = {State.ONLINE: "up", State.OFFLINE: "silent"}
 Document = Mapping[str, object]

@@ -4,7 +4,7 @@ Among it are conditions that are faults of their own, such as a line that is dow
 device. The alarms judge them.
 """
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -35,17 +35,13 @@ class Conditions:
 
     def __init__(self) -> None:
         self._by_owner: dict[str, dict[str, Condition]] = {}
-        self.version = 0  # grows with each change
 
     def put(self, owner: str, conditions: dict[str, Condition]) -> None:
         """Takes the place of all earlier conditions of the owner."""
         self._by_owner[owner] = conditions
-        self.version += 1
 
-    def all(self, without: Container[str] = ()) -> dict[str, Condition]:
-        """`without`: owners whose conditions are left out."""
-        wanted = (found for owner, found in self._by_owner.items() if owner not in without)
-        return {key: one for found in wanted for key, one in found.items()}
+    def all(self) -> dict[str, Condition]:
+        return {key: one for found in self._by_owner.values() for key, one in found.items()}
 
 
 Documents = Mapping[str, Document]

@@ -5,6 +5,15 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 
+class Priority(StrEnum):
+    """How soon an operator must act."""
+
+    CRITICAL = "critical"
+    HIGH = "high"
+    MEDIUM = "medium"
+    LOW = "low"
+
+
 class Level(StrEnum):
     """The kinds of limits. Of one side the worse one comes first."""
 
@@ -26,10 +35,12 @@ BELOW = frozenset({Level.LOW, Level.LOW_LOW, Level.OFF})  # reached from above
 @dataclass(frozen=True, slots=True)
 class AlarmRule:
     """A limit is reached at its value, and left when the value is `hysteresis` away from it. It
-    counts after `delay` seconds."""
+    counts after `delay` seconds, until it was left for `off_delay` seconds."""
 
     limits: Mapping[Level, float]  # a bit has one limit: its value in alarm
     hysteresis: float = 0.0
     delay: float = 0.0
+    off_delay: float = 0.0
+    priority: Priority = Priority.MEDIUM
     text: str = ""  # for people
     texts: Mapping[Level, str] = field(default_factory=dict)  # of levels with another text

@@ -10,17 +10,19 @@ import pytest
 from gateway.config import load
 from gateway.contract.status import BACK, is_silent
 from gateway.engine.device.health import State as Health
-from gateway.errors import LineDown, NoReply, NothingToAcknowledge
+from gateway.errors import ConfigError, LineDown, NoReply, NothingToAcknowledge
 from gateway.parts.alarms.board import OWN_AFTER, Entry
 from gateway.parts.alarms.file import parse, snapshot
 from gateway.parts.alarms.machine import Alarm, Event, State
 from gateway.parts.alarms.part import AlarmPart
+from gateway.parts.alarms.settings import WatchedSection
 from gateway.plant.plant import Plant
 from gateway.tags import AlarmRule, Level
 from tests.e2e.processes import write_config
 from tests.parts.made import alarms_of
 from tests.sim.virtual import on_virtual_time
 
+OFF = WatchedSection().off_delay
 OFFLINE = AlarmRule({Level.OFFLINE: True})
 
 
@@ -181,7 +183,7 @@ async def test_one_silent_line_is_one_alarm_and_the_devices_have_theirs_again(
     assert "part_of" in hall.document("pump1")
 
     hall.replies(1)
-    await hall.wait(BACK - 1)
+    await hall.wait(BACK + OFF - 1)
     assert hall.states() == "acknowledged normal normal normal"
     await hall.wait(2)  # the line is back, and its devices have some seconds to follow it
     assert hall.states() == "normal normal normal normal"
@@ -211,9 +213,10 @@ async def test_a_line_that_goes_down_takes_the_alarms_of_its_devices(tmp_path: P
     hall.open()
     await hall.wait(1)
     hall.falls(1, 2, 3)
-    await hall.wait(5)
+    await hall.wait(OFF + 1)
     assert hall.states() == "active normal normal normal"
-    assert hall.events() == ["line:hall ended", "line:hall raised"]
+    assert hall.document("line:hall")["level"] == "silent"
+    assert hall.events() == ["line:hall eased"]
 
 
 @on_virtual_time
@@ -252,7 +255,7 @@ async def test_a_restart_in_the_middle_keeps_line_devices_and_acknowledgement(
     await hall.wait(5)
     assert hall.events() == []
     hall.replies(1)
-    await hall.wait(BACK + OWN_AFTER + 2)
+    await hall.wait(BACK + OFF + OWN_AFTER + 2)
     assert hall.states() == "returned normal acknowledged active"
 
 
@@ -292,3 +295,40 @@ async def test_one_device_is_no_silent_line(tmp_path: Path) -> None:
     hall.falls(1)
     await hall.wait(5)
     assert hall.states() == "normal active"
+
+
+@pytest.mark.parametrize(
+    ("setting", "mistake"),
+    [
+        ({"devices": {"delay": "10x"}}, "devices.delay: 10x: x is no unit of time"),
+        ({"devices": {"prio": "high"}}, "devices.prio: no setting of devices: did you mean prio"),
+        ({"lines": {"priority": "urgent"}}, "lines.priority: 'urgent' is not known: use critical"),
+        ({"transfers": 3}, r"transfers: 3: write true, false or \{delay: 10s\}"),
+    ],
+)
+def test_a_wrong_setting_of_alarms_is_said(
+    tmp_path: Path, setting: dict[str, Any], mistake: str
+) -> None:
+    file = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {}, alarms=setting)
+    with pytest.raises(ConfigError, match=f"alarms.{mistake}"):
+        load(file)
+
+
+@on_virtual_time
+async def test_devices_have_the_delay_and_priority_of_the_file(tmp_path: Path) -> None:
+    settings = {"delay": "7s", "off_delay": "2s", "priority": "low"}
+    hall = Hall(tmp_path, alarms={"devices": settings, "lines": False})
+    hall.falls(1)
+    await hall.wait(6)
+    assert hall.events() == []
+    await hall.wait(2)
+    for _ in range(3):  # a bad contact
+        hall.replies(1)
+        await hall.wait(1)
+        hall.falls(1)
+        await hall.wait(1)
+    assert hall.events() == ["pump1 raised"]
+    assert hall.document("pump1")["priority"] == "low"
+    hall.replies(1)
+    await hall.wait(3)
+    assert hall.events() == ["pump1 ended"]

@@ -134,6 +134,31 @@ def test_a_value_that_is_back_before_the_delay_ends_is_no_alarm() -> None:
     assert alarm.events == []
 
 
+@pytest.mark.parametrize(
+    ("steps", "events"),
+    [
+        ([85, 70, 70, 85, 70], "raised"),  # it chatters: one alarm
+        ([85, 70, 4.9], "raised"),
+        ([85, 70, 5.0], "raised ended"),
+        ([85, 70, None, 100.0, 70, 3.9], "raised"),  # bad time does not count
+        ([85, 70, None, 100.0, 70, 4.0], "raised ended"),
+    ],
+)
+def test_an_alarm_ends_when_its_limit_was_left_for_the_off_delay(
+    steps: list[float | None], events: str
+) -> None:
+    """Integers are values, one second after the other; floats are seconds; None is bad."""
+    alarm = Driven(AlarmRule({Level.HIGH: HIGH}, off_delay=5.0))
+    for step in steps:
+        if step is None:
+            alarm.bad()
+        elif isinstance(step, int):
+            alarm.good(step)
+        else:
+            alarm.wait(step)
+    assert " ".join(alarm.events) == events
+
+
 def test_the_delay_of_a_worse_level_counts_from_that_level() -> None:
     alarm = Driven(AlarmRule({Level.HIGH_HIGH: 95, Level.HIGH: HIGH}, delay=5.0))
     alarm.good(85)
@@ -260,37 +285,41 @@ _STEPS = st.lists(
 class _Latch:
     """The reference for one limit, in steps of half a second."""
 
-    def __init__(self, sign: int, limit: float, delay: float) -> None:
-        self.sign, self.limit, self.delay = sign, sign * limit, delay
-        self.reached = False
-        self.held = 0.0  # seconds of good values since it is reached
+    def __init__(self, sign: int, limit: float, delay: float, off_delay: float) -> None:
+        self.sign, self.limit, self.delays = sign, sign * limit, (off_delay, delay)
+        self.reached = self.active = False
+        self.held = 0.0  # seconds of good values since it is reached, or left
 
     def good(self, value: float) -> None:
         value *= self.sign
         if self.reached and value <= self.limit - HYSTERESIS:
-            self.reached = False
+            self.reached, self.held = False, 0.0
         elif not self.reached and value >= self.limit:
             self.reached, self.held = True, 0.0
+        self.wait(0.0)
 
-    @property
-    def active(self) -> bool:
-        return self.reached and self.held >= self.delay
+    def wait(self, seconds: float) -> None:
+        self.held += seconds
+        if self.held >= self.delays[self.reached]:
+            self.active = self.reached
 
 
 @settings(max_examples=150)
-@given(_STEPS, st.sampled_from([0.0, 2.5]))
-def test_any_course_of_values(steps: list[tuple[float, float | str]], delay: float) -> None:
+@given(_STEPS, st.sampled_from([0.0, 2.5]), st.sampled_from([0.0, 5.0]))
+def test_any_course_of_values(
+    steps: list[tuple[float, float | str]], delay: float, off_delay: float
+) -> None:
     """Bad values hold everything, each change is a transition of the table, limits have their
     hysteresis and their delay."""
-    alarm = Driven(AlarmRule({Level.HIGH: HIGH, Level.LOW: LOW}, HYSTERESIS, delay))
-    latches = [_Latch(1, HIGH, delay), _Latch(-1, LOW, delay)]
+    alarm = Driven(AlarmRule({Level.HIGH: HIGH, Level.LOW: LOW}, HYSTERESIS, delay, off_delay))
+    latches = [_Latch(1, HIGH, delay, off_delay), _Latch(-1, LOW, delay, off_delay)]
     was_good = False
     for seconds, step in steps:
         before, seen = alarm.state(), len(alarm.events)
         alarm.wait(seconds)
         if was_good:
             for latch in latches:
-                latch.held += seconds
+                latch.wait(seconds)
         if not was_good:
             assert alarm.events[seen:] == []
         if step == "bad":

@@ -18,7 +18,7 @@ from gateway.protocols.registry import PROTOCOLS, Protocol
 
 S = TypeVar("S", bound=Section)
 
-# The branches of `write:`: pydantic names them in its places, the file does not.
+# The branches of `write:` and others: pydantic names them in its places, the file does not.
 _BRANCHES = ("flag", "rule")
 
 
@@ -120,6 +120,7 @@ def _inner(annotation: Any) -> type[BaseModel] | None:
 _FLAGS = {
     "write": "true, false or {min: 0, max: 100, verify: true}",
     "counter": "true, or {bits: 16, most: 1000}",
+    **dict.fromkeys(("devices", "lines", "transfers"), "true, false or {delay: 10s}"),
 }
 _NOT = {
     "bool_type": "is neither true nor false",

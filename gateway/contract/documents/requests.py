@@ -6,7 +6,7 @@ from typing_extensions import TypedDict
 
 from gateway.contract.documents.values import Origin, Time, Why, words
 from gateway.contract.problems import Problem
-from gateway.tags import Level
+from gateway.tags import Level, Priority
 from gateway.tags.shaping import Limited
 from gateway.values import Value
 from gateway.values.numerals import Scalar
@@ -118,6 +118,7 @@ class AlarmDocument(TypedDict):
     since: Time | None
     raised: Time | None
     acknowledged: Acknowledgement | None
+    priority: NotRequired[Annotated[Priority, words(*Priority)]]
     devices: NotRequired[list[str]]
     part_of: NotRequired[str]
 

@@ -271,7 +271,8 @@ class Alarms:
         now, parent = asyncio.get_running_loop().time(), self.entries.get(entry.parent)
         if parent is not None and parent.in_alarm:
             entry.own_from = now + OWN_AFTER
-        if now < entry.own_from:
+        returns = entry.reading.alarm is False and entry.alarm.reached is not None
+        if now < entry.own_from or (returns and entry.alarm.is_part):
             event = entry.alarm.fold(self._wall())
         else:
             event = entry.alarm.unfold(now, self._wall())

@@ -81,26 +81,28 @@ class Status(NamedTuple):
 
 
 class _Condition:
-    """One limit: reached or not, with hysteresis; it counts after the delay."""
+    """One limit with hysteresis. It counts when it was reached for the delay, until it was left for
+    the off-delay."""
 
-    __slots__ = ("_delay", "_hysteresis", "_limit", "_sign", "_since", "_waited", "active", "level")
+    __slots__ = ("_limit", "_reached", "_rule", "_sign", "_since", "_waited", "active", "level")
 
     def __init__(self, rule: AlarmRule, level: Level, limit: float) -> None:
         self.level = level
-        self.active = False  # reached for as long as the delay
+        self.active = False  # it counts
+        self._rule = rule
         self._sign = -1 if level in BELOW else 1
         self._limit = self._sign * limit
-        self._hysteresis = rule.hysteresis
-        self._delay = rule.delay
-        self._waited: float | None = None  # good time since the limit is reached; None: it is not
+        self._reached = False
+        self._waited = 0.0  # good time since it is reached, or left
         self._since: float | None = None  # that time runs since then
 
     @property
     def due(self) -> float | None:
         """When the delay ends; None while it does not run."""
-        if self._since is None or self._waited is None:
+        if self._since is None:
             return None
-        return self._since + self._delay - self._waited
+        delay = self._rule.delay if self._reached else self._rule.off_delay
+        return self._since + delay - self._waited
 
     def judge(self, value: float, now: float, *, certain: bool) -> None:
         value *= self._sign
@@ -108,30 +110,28 @@ class _Condition:
         if is_below and not certain:
             self.suspend(now)
             return
-        if is_below and (self._waited is None or are_apart(self._limit, value, self._hysteresis)):
-            self._waited = self._since = None
-            self.active = False
-            return
-        if self._waited is None:
-            self._waited = 0.0
-        if not self.active and self._since is None:
+        holds = self._reached and not are_apart(self._limit, value, self._rule.hysteresis)
+        reached = holds or not is_below
+        if reached is not self._reached:
+            self._reached, self._waited, self._since = reached, 0.0, None
+        if reached is not self.active and self._since is None:
             self._since = now
 
     def elapse(self, now: float) -> bool:
-        """True if the delay has ended now."""
+        """Ends the delay. True if the limit counts from now on."""
         if self.due is None or now < self.due:
             return False
-        self.active, self._since = True, None
-        return True
+        self.active, self._since = self._reached, None
+        return self.active
 
     def suspend(self, now: float) -> None:
         """Holds the time of the delay."""
-        if self._since is not None and self._waited is not None:
+        if self._since is not None:
             self._waited += max(0.0, now - self._since)
             self._since = None
 
     def restore(self) -> None:
-        self.active, self._waited, self._since = True, 0.0, None
+        self.active = self._reached = True
 
 
 class Alarm:
@@ -153,6 +153,11 @@ class Alarm:
         """When `elapse` is to be called; None: not needed."""
         return min((one.due for one in self._conditions if one.due is not None), default=None)
 
+    @property
+    def reached(self) -> Level | None:
+        """The worst limit that counts now."""
+        return next((one.level for one in self._conditions if one.active), None)
+
     def judge(
         self, value: Value, now: float, time: int, quality: Quality = Quality.GOOD
     ) -> Event | None:
@@ -173,8 +178,8 @@ class Alarm:
     def elapse(self, now: float, time: int) -> Event | None:
         """Applies the delays that have ended."""
         new = [one.level for one in self._conditions if one.elapse(now)]
-        level = next((one.level for one in self._conditions if one.active), None)
-        before, was_in_alarm = self.status, self.status.state in IN_ALARM
+        level, before = self.reached, self.status
+        was_in_alarm = before.state in IN_ALARM
         if before.folded and level is None:
             self.status = before = before._replace(folded=False, level=None)
         if self.is_part or level is (before.level if was_in_alarm else None):

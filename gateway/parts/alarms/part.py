@@ -16,9 +16,9 @@ from gateway.parts.alarms.board import Alarms, Entry
 from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.alarms.machine import Event, State
 from gateway.parts.alarms.settings import AlarmsSection
-from gateway.parts.alarms.watched import conditions
+from gateway.parts.alarms.watched import conditions, tuned
 from gateway.plant.part import Audits, Core, Kind
-from gateway.tags import Level, Quality, Sample, Tag
+from gateway.tags import Level, Priority, Quality, Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
@@ -37,7 +37,6 @@ class AlarmPart:
         self.alarms = Alarms(core.plant.tags(), core.plant.wall)
         self._settings = core.config.part(AlarmsSection) or AlarmsSection()
         self._file = AlarmFile(self._settings.path, self.alarms)
-        self._version = -1  # of the conditions
         self.alarms.subscribe(self._changed)
 
     # -- life --
@@ -60,9 +59,8 @@ class AlarmPart:
         """Follows the conditions of the plant and of other parts."""
         found = self._plant.doors.conditions
         now = asyncio.get_running_loop().time
-        own = conditions(self._plant.lines, self._settings, self.alarms.level, now)
-        found.put("alarms", own)
-        self.alarms.watch(found.all(without=() if self._settings.transfers else ("transfers",)))
+        found.put("alarms", conditions(self._plant.lines, self.alarms.level, now))
+        self.alarms.watch(tuned(found.all(), self._settings))
 
     async def take_over(self, config: Config, renewed: Mapping[Tag, Tag]) -> None:
         self._watch()
@@ -190,6 +188,7 @@ _OF_BITS = {Level.ON: True, Level.OFF: False}
 _WATCHED = (Level.OFFLINE, Level.DOWN, Level.SILENT, Level.STOPPED)
 # In the documents a part has ended, with `part_of`.
 _TOLD = {Event.FOLDED: Event.ENDED, Event.UNFOLDED: Event.RAISED}
+_URGENT = [*Priority]
 # The first alarms of a list: those that nobody has acknowledged.
 _ORDER = {State.ACTIVE: 0, State.RETURNED: 1, State.ACKNOWLEDGED: 2, State.NORMAL: 3}
 
@@ -222,6 +221,7 @@ def alarm_fields(
         "raised": rfc3339(status.raised) if status.raised else None,
         "acknowledged": by and {"by": by.by, "time": rfc3339(by.time), "via": by.via},
         "text": entry.text,
+        "priority": entry.alarm.rule.priority.value,
         **({"part_of": entry.part_of} if entry.part_of else {}),
         **({"devices": [part.key for part in parts]} if parts else {}),
     }
@@ -234,10 +234,14 @@ def _limit(entry: Entry, level: Level | None) -> float | bool | None:
 
 
 def open_alarms(alarms: Alarms) -> list[Entry]:
-    """Returns the alarms that are not normal: those without acknowledgement first, then the
-    newest."""
-    found = list(alarms.open.values())
-    return sorted(found, key=lambda entry: (_ORDER[entry.status.state], -entry.status.since))
+    """Returns the alarms that are not normal: those without acknowledgement first, then by
+    priority, then the newest."""
+
+    def place(entry: Entry) -> tuple[int, int, int]:
+        status, urgent = entry.status, _URGENT.index(entry.alarm.rule.priority)
+        return _ORDER[status.state], urgent, -status.since
+
+    return sorted(alarms.open.values(), key=place)
 
 
 def parse_acknowledgement(data: bytes) -> tuple[str, str | None]:

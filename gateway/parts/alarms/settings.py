@@ -1,11 +1,37 @@
 """The section `alarms` of the file."""
 
 from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Discriminator
+from pydantic import Tag as Choice
 
 from gateway.config.settings.sections import PartSection, Place, Written
 from gateway.config.settings.session_model import Section
-from gateway.config.settings.setting_types import FilePath
+from gateway.config.settings.setting_types import Duration, FilePath
 from gateway.tags import AlarmRule
+
+
+class WatchedSection(Section):
+    """Alarms without a limit: of devices, lines or transfers."""
+
+    priority: Literal["critical", "high", "medium", "low"] | None = None
+    """How soon an operator must act; left out: critical of lines, high of devices, medium of
+    transfers."""
+    delay: Duration | None = None
+    """It is an alarm after so long; left out: 0 s of devices, 3 s of others."""
+    off_delay: Duration = 5.0
+    """It is an alarm until it works for so long."""
+
+
+def _shape(value: object) -> str:
+    return "rule" if isinstance(value, (dict, WatchedSection)) else "flag"
+
+
+Watched = Annotated[
+    Annotated[WatchedSection, Choice("rule")] | Annotated[bool, Choice("flag")],
+    Discriminator(_shape),
+]
 
 
 class AlarmsSection(Section):
@@ -14,11 +40,11 @@ class AlarmsSection(Section):
     path: FilePath | None = None
     """Keeps alarms across restarts; left out: alarms.json in $STATE_DIRECTORY, or beside this file
     if a tag has an alarm."""
-    devices: bool = True
+    devices: Watched = True
     """A device that does not reply is an alarm."""
-    lines: bool = True
+    lines: Watched = True
     """A line that is down is an alarm."""
-    transfers: bool = True
+    transfers: Watched = True
     """A transfer that does not work is an alarm."""
 
 

@@ -1,6 +1,7 @@
 """The alarms that need no setting: devices that do not reply, lines that are down or silent."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from gateway.contract.line_faults import line_fault
@@ -8,20 +9,26 @@ from gateway.contract.status import device_document, is_silent
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.line.line import Line
-from gateway.parts.alarms.settings import AlarmsSection
+from gateway.parts.alarms.settings import AlarmsSection, WatchedSection
 from gateway.plant.doors import Condition, Reading
-from gateway.tags import AlarmRule, Level
+from gateway.tags import AlarmRule, Level, Priority
 
 # Seconds that a line is down before it is an alarm: an adapter that is plugged again, or a device
 # server that starts again, is back earlier.
 LINE_DELAY = 3.0
 LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
+_KINDS = {
+    Level.DOWN: ("lines", Priority.CRITICAL),
+    Level.OFFLINE: ("devices", Priority.HIGH),
+    Level.STOPPED: ("transfers", Priority.MEDIUM),
+}
+_USUAL = WatchedSection()
 _SILENT, _DOWN = 1.0, 2.0  # readings of a line
 LevelOf = Callable[[str], Level | None]  # of an alarm that is active, by its key
 
 
 def conditions(
-    lines: Iterable[Line], config: AlarmsSection, level_of: LevelOf, now: Callable[[], float]
+    lines: Iterable[Line], level_of: LevelOf, now: Callable[[], float]
 ) -> dict[str, Condition]:
     """Returns the conditions of lines and of their devices, by the key of their alarm. `now`: by
     the line's clock."""
@@ -29,19 +36,37 @@ def conditions(
     for line in lines:
         name = line.engine.name
         key = f"{LINE}{name}"
-        if config.lines:
-            rule = AlarmRule(
-                {Level.DOWN: _DOWN, Level.SILENT: _SILENT},
-                delay=LINE_DELAY,
-                text=f"line {name} is down",
-                texts={Level.SILENT: f"line {name} is silent"},
-            )
-            found[key] = Condition(rule, partial(_line, line, partial(level_of, key), now))
-        for device in line.engine.devices if config.devices else ():
+        rule = AlarmRule(
+            {Level.DOWN: _DOWN, Level.SILENT: _SILENT},
+            delay=LINE_DELAY,
+            text=f"line {name} is down",
+            texts={Level.SILENT: f"line {name} is silent"},
+        )
+        found[key] = Condition(rule, partial(_line, line, partial(level_of, key), now))
+        for device in line.engine.devices:
             rule = AlarmRule({Level.OFFLINE: True}, text=f"{device.name} does not reply")
             parent = key if device.health.is_probed else ""
             found[device.name] = Condition(rule, partial(_device, device), parent)
     return found
+
+
+def tuned(found: Mapping[str, Condition], config: AlarmsSection) -> dict[str, Condition]:
+    """Returns the conditions that the file wants, with its delays and priorities."""
+    wanted = {}
+    for key, one in found.items():
+        setting, priority = _KINDS[next(iter(one.rule.limits))]
+        own: bool | WatchedSection = getattr(config, setting)
+        if own is False:
+            continue
+        own = _USUAL if own is True else own
+        rule = replace(
+            one.rule,
+            priority=Priority(own.priority or priority),
+            delay=one.rule.delay if own.delay is None else own.delay,
+            off_delay=own.off_delay,
+        )
+        wanted[key] = one._replace(rule=rule)
+    return wanted
 
 
 def _line(line: Line, level: Callable[[], Level | None], now: Callable[[], float]) -> Reading:

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from pydantic import model_validator
 
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import Distance, Duration, Finite, Text
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings, for_one
-from gateway.tags import AlarmRule, Level
+from gateway.tags import AlarmRule, Level, Priority
 from gateway.tags.scaling import decimal
 from gateway.values import Kind
 
@@ -36,6 +36,10 @@ class AlarmSection(Section):
     """A limit is left when the value is so far from it, in the unit of the tag."""
     delay: Duration = 0.0
     """A limit counts when it is reached for so long."""
+    off_delay: Duration = 0.0
+    """It counts until it is left for so long."""
+    priority: Literal["critical", "high", "medium", "low"] = "medium"
+    """How soon an operator must act."""
     text: Text = ""
     """A sentence for people; left out: the description of the tag."""
 
@@ -102,7 +106,8 @@ def _make(own: Any, facts: Facts) -> AlarmRule | None:
     }
     limits |= {level: value for level, value in _OF_BITS.items() if getattr(section, level)}
     text = section.text or facts.settings.description
-    return AlarmRule(limits, section.hysteresis, section.delay, text)
+    delays = section.delay, section.off_delay
+    return AlarmRule(limits, section.hysteresis, *delays, Priority(section.priority), text)
 
 
 FEATURE = Feature(own=AlarmSettings, computed=frozenset({"alarm"}), check=_check, make=_make)

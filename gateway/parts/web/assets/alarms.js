@@ -87,7 +87,7 @@ function showRow(row, one) {
   put(row.detail, one.detail && !one.why.includes(one.detail) ? one.detail : "");
   const done = state === "acknowledged";
   const by = done ? `acknowledged by ${acknowledged.by}, ${moment(Date.parse(acknowledged.time))}` : `${state} since ${moment(Date.parse(one.since))}`;
-  put(row.where, [one.alarm.replace(/^line:/, "line "), "time" in one ? text : "", by].filter(Boolean).join(" · "));
+  put(row.where, [one.priority, one.alarm.replace(/^line:/, "line "), "time" in one ? text : "", by].filter(Boolean).join(" · "));
   const parts = one.devices ?? [];
   row.parts.hidden = !parts.length;
   put(row.count, `${parts.length} devices`);
