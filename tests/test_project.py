@@ -1,4 +1,4 @@
-"""The project's own files agree: version, licence, typing, supported Pythons, hosted CI."""
+"""The project's own files agree: version, licence, typing, supported Pythons."""
 
 import re
 import subprocess
@@ -18,11 +18,6 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf
 PYTHONS = re.findall(
     r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]), re.MULTILINE
 )
-
-
-def workflow() -> dict[str, Any]:
-    loaded: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text("utf-8"))
-    return loaded
 
 
 def test_the_package_has_one_version() -> None:
@@ -73,14 +68,6 @@ def test_the_container_is_built_with_every_file_that_the_build_needs() -> None:
     assert set(copied[0].split()) >= {"pyproject.toml", "README.md", "LICENSE", "constraints.txt"}
 
 
-def test_hosted_ci_runs_the_same_as_a_developer_on_every_supported_python() -> None:
-    job = workflow()["jobs"]["test"]
-    assert job["strategy"]["matrix"]["python"] == PYTHONS
-    [run] = [step for step in job["steps"] if "run" in step]
-    assert run["run"] == "bash .ci/run"
-    assert run["env"]["PYTHON"] == "python${{ matrix.python }}"
-
-
 def test_the_lowest_supported_python_is_the_one_that_pip_accepts() -> None:
     assert PROJECT["project"]["requires-python"] == f">={PYTHONS[0]}"
     assert PROJECT["tool"]["mypy"]["python_version"] == PYTHONS[0]
@@ -112,11 +99,6 @@ def test_every_pinned_package_is_pinned_by_hashes_and_in_both_files_alike() -> N
     assert [name for name, line in of_all.items() if "--hash=sha256:" not in line] == []
     for file in ("Makefile", "Dockerfile", "docs/deployment.md"):
         assert "--require-hashes --requirement constraints.txt" in (ROOT / file).read_text()
-
-
-def test_hosted_ci_asks_whether_a_pinned_version_has_a_known_weakness() -> None:
-    steps = workflow()["jobs"]["audit"]["steps"]
-    assert [step["run"] for step in steps if "run" in step] == ["bash .ci/audit"]
 
 
 def test_every_package_of_the_project_has_a_pin() -> None:
