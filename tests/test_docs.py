@@ -61,7 +61,7 @@ OF_DEVICES = "no-protocol.md"
 # The pages whose Python programs run here against the example gateway.
 OF_PROGRAMS = (
     *("read-values.md", "slow-links.md", "write-values.md", "write-groups.md"),
-    *("browse.md", "contract.md"),
+    *("browse.md", "contract.md", "provenance.md"),
 )
 # The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.

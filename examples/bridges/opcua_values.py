@@ -19,6 +19,11 @@ STATUS = {
     reason: getattr(Code, codes["opcua"])
     for reason, codes in json.loads((Path(__file__).parent / "reasons.json").read_text()).items()
 } | {"no-gateway": Code.BadNoCommunication}
+ORIGIN = {
+    "simulated": Code.GoodEdited,
+    "replayed": Code.GoodEdited,
+    "held": Code.GoodLocalOverride,
+}
 LIMITED = {"low": 0x0500, "high": 0x0600}  # limit bits of a status code, of a data value
 TYPES = {  # by the type of a tag; the others are texts
     "bool": Type.Boolean,
@@ -54,8 +59,8 @@ def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
         code = Code.BadTypeMismatch
     else:
         code = Code.Good if quality == "good" else STATUS.get(reason, Code.Uncertain)
-        if quality == "good" and known.get("origin") == "simulated":
-            code = Code.GoodEdited  # no plain reading of a device: not simply Good
+        if quality == "good":  # not simply Good, unless it is the reading of a device
+            code = ORIGIN.get(known.get("origin", ""), code)
         code |= LIMITED.get(known.get("limited", ""), 0)
     return ua.DataValue(variant or ua.Variant(), ua.StatusCode(code), time, now)
 

@@ -101,8 +101,8 @@ def next_steps(config: Config, path: Path, command: str) -> str:
     ]
     if tags:
         lines.append(f"  {command} read {file} {tags[0].key}")
-    simulated = (tag for line in config.lines if line.simulated for tag in line.tags)
-    for tag in simulated:  # a proposed write must move no machine
+    not_real = (tag for line in config.lines if line.not_real for tag in line.tags)
+    for tag in not_real:  # a proposed write must move no machine
         if tag.write is not None and tag.element is None:
             lines.append(f"  {command} write {file} {tag.key} {_example(tag)}")
             break

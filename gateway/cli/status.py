@@ -4,7 +4,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from rich.console import Group, RenderableType
@@ -16,6 +16,7 @@ from gateway.cli.repeated import repeated
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.line_faults import span
+from gateway.tags.tag import NotReal
 
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
@@ -100,13 +101,14 @@ def _standby(documents: Documents) -> str:
 
 
 def _lines(documents: Documents) -> Table:
-    simulated = documents["status"].get("simulated", ())
+    status = documents["status"]
+    origins = {name: word for word in get_args(NotReal) for name in status.get(word, ())}
     table = _table("line", "state", "open for", "load", "expected", "requests/s", "slowest write")
     for name, document in below("lines/", documents):
         measured, expected = document["measured"], document["expected"]
         table.add_row(
             Text(name),
-            _state(("simulated" if name in simulated else "open") if document["open"] else "down"),
+            _state(origins.get(name, "open") if document["open"] else "down"),
             Text(span(document["open_for"])),
             Text(_share(measured["load"])),
             Text(_share(expected["load"])),

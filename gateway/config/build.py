@@ -6,7 +6,7 @@ from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
-from gateway.config.line_rules import check_line, line_wire, modem_of
+from gateway.config.line_rules import check_line, line_wire, modem_of, origin_of
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.port_rules import check_device_servers, port_of
 from gateway.config.settings import parsers
@@ -37,8 +37,8 @@ from gateway.protocols.capabilities import Identifies
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Tag
-from gateway.tags.tag import READ
-from gateway.transport.port import ListenAddress, ModemAddress, SerialPath, SimulatorAddress
+from gateway.tags.tag import READ, NotReal
+from gateway.transport.port import ListenAddress, ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
@@ -122,6 +122,7 @@ class Builder:
         if not isinstance(raw, dict):
             return None
         defaults = self._defaults(raw, path, outer)
+        not_real = None if line is None else origin_of(line, path, self.mistakes)
         devices = []
         for device_name, raw_device in mapping(raw.get("devices")):
             place: Path = (*path, "devices", device_name)
@@ -134,9 +135,8 @@ class Builder:
                 )
             self._devices.setdefault(checked, name)
             serve = line is not None and line.serve
-            simulated = line is not None and line.port == SimulatorAddress()
             device = self._device(
-                checked, raw_device, place, defaults, serve=serve, simulated=simulated
+                checked, raw_device, place, defaults, serve=serve, not_real=not_real
             )
             if device is not None:
                 devices.append(device)
@@ -163,6 +163,7 @@ class Builder:
             connect_delay=line.connect_delay,
             close_after=line.close_after or "",
             listen_only=line.listen_only,
+            not_real=not_real,
             serve=line.serve,
             request_gap=request_gap(line, dials=modem is not None),
             devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
@@ -176,7 +177,7 @@ class Builder:
         outer: TagDefaults,
         *,
         serve: bool,
-        simulated: bool,
+        not_real: NotReal | None,
     ) -> DeviceSettings | None:
         if not isinstance(raw, dict):
             section(DeviceSection, raw, path, self.mistakes, "a device")
@@ -190,14 +191,14 @@ class Builder:
         self._intervals[name] = defaults.every
         place: Path = (*path, "tags")
         tags = self._tags.build(
-            name, raw.get("tags"), place, defaults, addressing, simulated=simulated
+            name, raw.get("tags"), place, defaults, addressing, not_real=not_real
         )
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
         for sheet in filter(None, (own_sheet, self.imports.get(name))):
             place, taken = (*path, "tags_from"), {tag.name for tag in tags}
             tags += self._sheets.build(
-                name, sheet, place, defaults, addressing, taken, simulated=simulated
+                name, sheet, place, defaults, addressing, taken, not_real=not_real
             )
         if settings is None or driver is None:
             return None
@@ -238,7 +239,7 @@ class Builder:
     ) -> None:
         own = driver.identity_names if isinstance(driver, Identifies) else ()
         areas = driver.areas
-        read = [tag for tag in tags if tag.origin == READ and tag.polled]
+        read = [tag for tag in tags if replace(tag.origin, not_real=None) == READ and tag.polled]
         known = {tag.name for tag in read if areas[tag.span.area].readable}
         for name in set(names) - known - set(own):
             also = f", or {one_of(sorted(own))}" if own else ""

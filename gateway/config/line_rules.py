@@ -12,6 +12,7 @@ from gateway.protocols.capabilities import EchoConflict
 from gateway.protocols.listening import Listenable
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.stations.registry import can_simulate
+from gateway.tags.tag import NotReal
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
     ListenAddress,
@@ -52,6 +53,15 @@ def check_line(
             mistakes.add((*place, setting), f"the line has `echo: true`, and {reason}")
         if driver.traits.over_network:
             _check_network(line, devices, device, place, mistakes)
+
+
+def origin_of(line: LineSection, path: Path, mistakes: Mistakes) -> NotReal | None:
+    """Returns what stands behind the port instead of devices; None: real devices do."""
+    simulator = isinstance(line.port, SimulatorAddress)
+    if line.origin is not None and (simulator or line.serve):
+        why = "port: simulator says it already" if simulator else "a served line reads no PLC"
+        mistakes.add((*path, "origin"), f"{why}: remove origin")
+    return "simulated" if simulator else line.origin
 
 
 def _check_format(

@@ -3,10 +3,9 @@
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
 value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
 in `detail`. A value with a name has it in `text`. One that is no plain reading of a device has its
-`origin`: `simulated` or `computed`. One at an end of its clamp is `limited`: `low` or `high`. One
-outside the range of its sensor is `uncertain`, with a `reason`.
-Integers stay JSON integers whatever their size: beyond 2**53 a reader in JavaScript must parse them
-itself.
+`origin`: `simulated`, `replayed`, `held` or `computed`. One at an end of its clamp is `limited`:
+`low` or `high`. One outside the range of its sensor is `uncertain`, with a `reason`. Integers stay
+JSON integers whatever their size: beyond 2**53 a reader in JavaScript must parse them itself.
 """
 
 import json

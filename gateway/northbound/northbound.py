@@ -344,7 +344,13 @@ class Northbound:
         links = {"to": self._links.kinds(), "connect": endpoints(self._config, "connect")}
         zenoh_document = {**self.counters(), **links}
         own = {"zenoh": zenoh_document, "outcomes": self._incoming.outcomes()}
-        return {**documents, **own, **self._admission.documents()}
+        origins = {
+            device.name: word
+            for device in self._plant.devices()
+            for tag in [*device.tags][:1]
+            if (word := tag.origin.not_real) is not None
+        }
+        return {**documents, **own, **self._admission.documents(origins)}
 
 
 def check(config: Config) -> list[str]:

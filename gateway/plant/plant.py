@@ -4,7 +4,7 @@ import asyncio
 import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, get_args
 
 from gateway import __version__
 from gateway.config import Config, LineConfig
@@ -28,6 +28,7 @@ from gateway.plant.on_demand import OnDemand
 from gateway.plant.write_path import WritePath
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
+from gateway.tags.tag import NotReal
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -321,7 +322,10 @@ class Plant:
                 "time": rfc3339(self._wall()),
                 "up": round(time.monotonic() - self._started, 1),
                 "tags": len(self._tags),
-                "simulated": [line.name for line in self.config.lines if line.simulated],
+                **{
+                    word: [line.name for line in self.config.lines if line.not_real == word]
+                    for word in get_args(NotReal)
+                },
             }
         }
         forecasts = self._expected.lines()

@@ -82,7 +82,7 @@ class WriteResult(NamedTuple):
     verified: bool = False  # read back and found equal
     acknowledged: bool = True  # False only for a broadcast: no device acknowledges it
     note: str = ""  # what the client must know of the way in which it was written
-    origin: OriginWord | None = None  # simulated: no real device holds the value
+    origin: OriginWord | None = None  # unless a real device holds the value
 
 
 def has_json(value: Value | None) -> bool:

@@ -55,7 +55,8 @@ class Label:
     description: str = ""
 
 
-OriginWord = Literal["simulated", "computed"]
+NotReal = Literal["simulated", "replayed"]  # instead of a device
+OriginWord = NotReal | Literal["held", "computed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,18 +70,19 @@ class Origin:
     # Of the formula, in its order; of a kept value the one tag with its reads. These are the tags
     # of another tag's value: this tag is not read itself.
     inputs: tuple["Tag", ...] = ()
-    simulated: bool = False  # by a line with `port: simulator`
+    held: bool = False  # written by clients, for a master that reads it
+    not_real: NotReal | None = None  # behind the port of the line
 
     @property
     def word(self) -> OriginWord | None:
         """Returns the word of the contract; None: a plain reading of a device."""
-        if self.simulated:
-            return "simulated"
-        return None if self.formula is None else "computed"
+        if self.not_real is not None or self.held:
+            return self.not_real or "held"
+        counts = isinstance(self.kept, CounterRule)
+        return "computed" if counts or self.formula is not None else None
 
 
 READ = Origin()
-_SIMULATED = Origin(simulated=True)
 _NO_LABEL = Label()
 
 
@@ -155,10 +157,9 @@ class Tag:
     def label(self) -> Label:
         return self.feature(Label) or _NO_LABEL
 
-    def as_simulated(self) -> "Tag":
-        """Returns the same tag of a simulated device."""
-        known = self.origin
-        return replace(self, origin=_SIMULATED if known is READ else replace(known, simulated=True))
+    def with_origin(self, word: NotReal | None) -> "Tag":
+        """Returns the same tag of a device that is not real; None: itself."""
+        return self if word is None else replace(self, origin=replace(self.origin, not_real=word))
 
     def copy(self, device: str, name: str) -> "Tag":
         """Returns the same tag under another name. Ten times faster than `replace`."""
@@ -199,7 +200,7 @@ class Tag:
     @property
     def recorded_key(self) -> str:
         """The name of its samples in the history: simulated ones are never among real ones."""
-        return f"{self.key}@simulated" if self.origin.simulated else self.key
+        return self.key if (word := self.origin.not_real) is None else f"{self.key}@{word}"
 
     @property
     def exact_below(self) -> float | None:

@@ -20,7 +20,7 @@ RUNS, IN_RUN = 5, 400
 YEARS = 3650 * 86400  # seconds
 EXPORT = ("history", "export", "--time", "[..]")
 DOCUMENT = "plant/@gateway/demo/history"
-SPEED, TEXT = tag("speed").as_simulated(), tag("text").as_simulated()
+SPEED, TEXT = tag("speed").with_origin("simulated"), tag("text").with_origin("simulated")
 
 
 def plant(folder: Path, endpoint: str) -> Path:

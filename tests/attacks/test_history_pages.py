@@ -15,7 +15,7 @@ from tests.history.recorded import NOON, SECOND, store_run
 from tests.history_writer import tag
 from tests.zenoh_peer import Reply, ZenohPeer, free_endpoint
 
-TAGS = [tag(f"t{n}").as_simulated() for n in range(20)]
+TAGS = [tag(f"t{n}").with_origin("simulated") for n in range(20)]
 RUNS, IN_RUN = 5, 400
 EVERYTHING = {f"{TAGS[n % 20].key} {n}" for n in range(RUNS * IN_RUN)}
 

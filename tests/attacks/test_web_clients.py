@@ -60,7 +60,7 @@ async def whole(port: int, request: str) -> bytes:
 def plant(folder: Path, port: int) -> Path:
     secret(folder / "tokens.txt", f"page:{TOKEN}\n")
     with closing(HistoryFile(folder / "history.db", 10**8)) as file:
-        store_run(file, numbered(10_000, tag=SPEED.as_simulated()))
+        store_run(file, numbered(10_000, tag=SPEED.with_origin("simulated")))
     mixer = {"protocol": "vigor", "enabled": False, "tags": {"speed": {"address": "D1"}}}
     oven = vigor_line("simulator", {"recipe": {"address": "D500", "write": True}})["devices"]
     lines = {

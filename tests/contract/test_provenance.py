@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,13 +20,14 @@ from gateway.contract.meta import meta_fields
 from gateway.contract.past import buckets
 from gateway.contract.past.buckets import Now
 from gateway.contract.past.question import Question
-from gateway.tags import Reason, Tag, bad, good
+from gateway.parts.web.events import Page
+from gateway.tags import Reason, Sample, Tag, bad, good
 from gateway.tags.sample import converted
 from tests.history.recorded import EVERYTHING, NOON, SECOND, history
 
 ROOT = Path(__file__).parents[2]
 BRIDGES = ROOT / "examples" / "bridges"
-PAGE = (ROOT / "docs" / "contract.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "provenance.md").read_text("utf-8")
 FILE = """
 gateway: {name: demo}
 zenoh: {prefix: plant, listen: [tcp/127.0.0.1:0]}
@@ -35,6 +37,14 @@ lines:
   sim:
     port: simulator
     devices: {a: {protocol: vigor, station: 1, tags: {simulated: {address: D1}}}}
+  log:
+    port: tcp://127.0.0.1:4001
+    origin: replayed
+    devices: {r: {protocol: vigor, station: 1, tags: {replayed: {address: D1}}}}
+  panel:
+    port: /dev/ttyS1
+    serve: true
+    devices: {p: {protocol: vigor, station: 1, tags: {held: {address: D1, write: true}}}}
   hall:
     port: /dev/ttyS0
     devices:
@@ -44,6 +54,7 @@ lines:
         tags:
           plain: {address: D1}
           computed: {computed: plain * 2}
+          counted: {address: D2, counter: true}
           clamped: {address: D2, clamp: [0, 100]}
           ranged: {address: D2, range: [0, 50]}
           half: {address: D3, clamp: [null, 100]}
@@ -60,10 +71,10 @@ def tags(tmp_path: Path) -> dict[str, Tag]:
 
 @pytest.fixture
 def bridges(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
-    """The modules of two bridges: a bridge runs without the package `gateway`."""
+    """The modules of bridges: a bridge runs without the package `gateway`."""
     monkeypatch.syspath_prepend(BRIDGES)
     before = set(sys.modules)
-    yield {name: importlib.import_module(name) for name in ("influx", "opcua_values")}
+    yield {name: importlib.import_module(name) for name in ("influx", "mqtt", "opcua_values")}
     for path in BRIDGES.glob("*.py"):
         if path.stem not in before:
             sys.modules.pop(path.stem, None)
@@ -88,7 +99,9 @@ def shown(tag: Tag, value: int, folder: Path, bridges: dict[str, Any]) -> dict[s
         "bucket": _about(buckets.fields(tag, bucket, ["last"])),
         "`@meta`": _about(meta_fields(tag)),
         "`read`, `watch`": str(quality),
+        "page": _of_page(sample),
         "CSV": _about(dict(zip(names, _row(past), strict=True))),
+        "MQTT": _about(_of_mqtt(bridges["mqtt"], tag, known)),
         "OPC UA": _of_opcua(bridges["opcua_values"], tag, known),
         "InfluxDB": ", ".join(
             part.replace('"', "").replace("=", ": ")
@@ -102,10 +115,28 @@ def _of_opcua(opcua: Any, tag: Tag, known: dict[str, Any]) -> str:
     code = opcua.data_value(known, opcua.type_of(meta_fields(tag))).StatusCode.value
     names = {
         getattr(opcua.Code, name): name
-        for name in ("Good", "GoodEdited", "UncertainEngineeringUnitsExceeded")
+        for name in (
+            *("Good", "GoodEdited", "GoodLocalOverride"),
+            "UncertainEngineeringUnitsExceeded",
+        )
     }
     bits = {0: "", 0x500: ", limit bits low", 0x600: ", limit bits high"}
     return names[code & 0xFFFF0000] + bits[code & 0xFFFF]
+
+
+def _of_page(sample: Sample) -> str:
+    core: Any = SimpleNamespace(plant=SimpleNamespace(sample=lambda _: sample))
+    page = Page(core, core, [sample.tag], None)
+    [[_, _, quality, _, why, _]] = page._values([sample.tag])  # without a server and its events
+    return str(why) if quality == "good" else f"{quality}: {why}"
+
+
+def _of_mqtt(mqtt: Any, tag: Tag, known: dict[str, Any]) -> Any:
+    bridge = mqtt.Bridge("plant", expire=0, writes=False, commands="")
+    bridge.plant = SimpleNamespace(tags={tag.key: meta_fields(tag)})
+    bridge.changed(tag.key, known)
+    [document] = bridge._retained.values()  # what the broker would get
+    return json.loads(document)
 
 
 def _about(document: dict[str, Any]) -> str:
@@ -117,20 +148,25 @@ def _about(document: dict[str, Any]) -> str:
 def test_the_table_of_the_page_is_what_each_way_shows(
     tags: dict[str, Tag], tmp_path: Path, bridges: dict[str, Any]
 ) -> None:
-    cases = {"plain": 7, "simulated": 7, "computed": 7, "clamped": 100, "ranged": 51}
-    found = {name: shown(tags[name], value, tmp_path, bridges) for name, value in cases.items()}
+    origins = ("simulated", "replayed", "held", "computed")
+    ends = {"clamped": 100, "ranged": 51}
+    values = {"plain": 7, **dict.fromkeys((*origins, "counted"), 7), **ends}
+    found = {name: shown(tags[name], value, tmp_path, bridges) for name, value in values.items()}
     rows = [
-        f"| {way} | {' | '.join(found[name][way] or '–' for name in cases)} |"
+        f"| {way} | {' | '.join(found[name][way] or '–' for name in columns)} |"
+        for columns in (("plain", *origins), ends)
         for way in found["plain"]
     ]
-    table = (
-        PAGE.partition("## Where a value comes from")[2].partition("|---|")[2].partition("\n")[2]
-    )
-    assert table.partition("\n\n")[0].splitlines() == rows
-    marked = {way for way, text in found["simulated"].items() if text not in ("", "good", "Good")}
-    assert marked == set(found["simulated"])
-    silent = {way for way, text in found["ranged"].items() if text in ("", "good", "Good")}
-    assert silent == {"`@meta`"}
+    lines = PAGE.partition("## An uncertain value")[0].splitlines()
+    ways = tuple(f"| {way} |" for way in found["plain"])
+    assert [line for line in lines if line.startswith(ways)] == rows
+    assert found["counted"] == found["computed"]
+
+    def silent(name: str) -> set[str]:
+        return {way for way, text in found[name].items() if text in ("", "good", "Good")}
+
+    assert [silent(name) for name in origins] == [set(), set(), set(), {"OPC UA"}]
+    assert silent("ranged") == {"`@meta`"}
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,8 @@ async def test_the_time_without_a_gateway_is_a_gap(tmp_path: Path) -> None:
     with closing(HistoryFile(history, 10**8)) as file:
         # The earlier gateway ended 1000 s after the last change of the speed.
         earlier = [
-            good(tag("speed").as_simulated(), 5, now - 4000 * SECOND),
-            good(tag("n").as_simulated(), 1, now - 3000 * SECOND),
+            good(tag("speed").with_origin("simulated"), 5, now - 4000 * SECOND),
+            good(tag("n").with_origin("simulated"), 1, now - 3000 * SECOND),
         ]
         file.store(1, earlier)
     tags = {"speed": {"address": "D{first}"}, "n": {"address": "D{first + 1}"}}

@@ -22,6 +22,7 @@ EXPECTED = {"plant/meter/a": 17, "plant/meter/b": 34, "plant/meter/c": "refused"
 async def values(client: ZenohPeer) -> dict[str, object]:
     """Returns the value of each tag, or why it has none."""
     replies = await client.get("plant/meter/*")
+    assert {reply.json["origin"] for reply in replies} <= {"replayed"}
     return {str(reply.key): reply.json.get("reason", reply.json["value"]) for reply in replies}
 
 
@@ -35,10 +36,11 @@ async def test_a_gateway_on_a_served_recording_gets_the_recorded_values(tmp_path
     }
     device = {"protocol": "modbus-rtu", "station": 1, "tags": tags}
     line = {"port": f"tcp://127.0.0.1:{port}", "baudrate": 9600, "devices": {"meter": device}}
+    line["origin"] = "replayed"
     config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line})
     with gateway("replay", log, "--serve", "--tcp", f"127.0.0.1:{port}") as plant:
         said = await asyncio.to_thread(plant.says, "Ctrl-C")
-        assert said == f"at tcp://127.0.0.1:{port}; Ctrl-C ends it."
+        assert said.startswith(f"at tcp://127.0.0.1:{port}; a line that reads it needs `origin: ")
         with await asyncio.to_thread(started, config) as reader:
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 async with asyncio.timeout(PATIENCE):

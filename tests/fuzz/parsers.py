@@ -108,7 +108,7 @@ def claim(data: bytes) -> None:
     for secret in (None, OTHERS):
         claims = ClaimDocuments(KEYS, secret)
         if (found := claims.parse(CLAIM, data, 0.0)) is not None:
-            payload.document(claims.document(found))
+            payload.document(claims.document(found, {}))
 
 
 def token(data: bytes) -> None:

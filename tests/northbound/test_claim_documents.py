@@ -10,11 +10,12 @@ from gateway.contract.keys import Keys
 from gateway.northbound.group.claim_documents import ClaimDocuments
 from gateway.northbound.group.claims import LAST_TICKET, Claim
 from gateway.northbound.group.plant_secret import PlantSecret
+from gateway.tags.tag import NotReal
 
 SECRET = PlantSecret("a secret of twenty or more")
 CLAIM = Claim(7, "5e55", "a", None, frozenset({"mixer", "oven"}))
 KEY = "plant/@gateway/a/claim/5e55"
-SIGNED = ClaimDocuments(Keys("plant", "a"), SECRET).document(CLAIM)
+SIGNED = ClaimDocuments(Keys("plant", "a"), SECRET).document(CLAIM, {})
 FORGED = {
     "no signature": {"ticket": 7, "group": None, "devices": ["mixer", "oven"]},
     "a signature of nothing": SIGNED | {"signature": ""},
@@ -55,8 +56,16 @@ def test_a_signature_is_good_for_one_gateway_and_its_session(name: str) -> None:
 
 def test_without_a_secret_every_claim_counts() -> None:
     without = other(None)
-    for document in (SIGNED, FORGED["no signature"], without.document(CLAIM)):
+    for document in (SIGNED, FORGED["no signature"], without.document(CLAIM, {})):
         assert without.parse(KEY, orjson.dumps(document), 0.0) == CLAIM
+
+
+def test_a_claim_names_the_devices_that_are_not_real() -> None:
+    origins: dict[str, NotReal] = {"mixer": "simulated", "press": "replayed"}
+    document = ClaimDocuments(Keys("plant", "a"), SECRET).document(CLAIM, origins)
+    assert document["origins"] == {"mixer": "simulated"}  # the press is none of its devices
+    assert "origins" not in SIGNED
+    assert other().parse(KEY, orjson.dumps(document), 0.0) == CLAIM
 
 
 WRONG = {

@@ -113,6 +113,7 @@ class PlainNorth:
             "up": 5.0,
             "tags": 4,
             "simulated": [],
+            "replayed": [],
             "lines": {},
             "devices": {},
             "refused_devices": {},

@@ -187,7 +187,8 @@ async def _serve(
                 f"{device.name}: station {device.driver.station}, {len(course.first)} addresses, "
                 f"{len(course.changes)} values in {last - begin:.0f} s"
             )
-        say(f"at {served.address}; Ctrl-C ends it.")
+        needs = "a line that reads it needs `origin: replayed`"
+        say(f"at {served.address}; {needs}; Ctrl-C ends it.")
         await stop.wait()
     finally:
         await served.close()

@@ -55,7 +55,7 @@ async def serve(
             stack.push_async_callback(served.close)
             stations = ", ".join(str(device.driver.station) for device in line.devices)
             say(f"line {line.name}: stations {stations} at {served.address}")
-        say("Ctrl-C ends it.")
+        say("A line that reads them needs `origin: simulated`. Ctrl-C ends it.")
         await stop.wait()
 
 

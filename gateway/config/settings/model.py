@@ -25,6 +25,7 @@ from gateway.config.settings.setting_types import (
     Port,
     Text,
 )
+from gateway.tags.tag import NotReal
 
 
 class WritersSection(Section):
@@ -104,6 +105,8 @@ class LineSection(Section):
     """Speed of the line, also behind a device server; left out: the default of the protocol."""
     format: Annotated[str | None, Parsed(parsers.serial_format, FORMAT_SCHEMA)] = None
     """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
+    origin: NotReal | None = None
+    """Of a port that leads to no real device: simulated PLCs, or a recording that is replayed."""
     echo: bool | None = None
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
     rs485: Rs485Section | None = None

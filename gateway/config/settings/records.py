@@ -11,6 +11,7 @@ from gateway.config.sheets.tags import SheetUse
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
+from gateway.tags.tag import NotReal
 from gateway.tags.transfer import TransferRule
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
@@ -33,6 +34,7 @@ class LineConfig:
     connect_delay: float = 0.0  # seconds from the connection to the first request
     close_after: str = ""  # "round": connected only while polls are due
     listen_only: bool = False  # another master owns the wire: nothing is ever sent
+    not_real: NotReal | None = None  # behind the port; None: real devices
     devices: tuple[DeviceSettings, ...]
 
     @property

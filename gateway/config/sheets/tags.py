@@ -16,6 +16,7 @@ from gateway.errors import ConfigError
 from gateway.protocols.capabilities import NamesRegisters
 from gateway.protocols.driver import Addressing
 from gateway.tags import Tag
+from gateway.tags.tag import NotReal
 
 
 class SheetUse(NamedTuple):
@@ -63,7 +64,7 @@ class SheetTags:
         driver: Addressing | None,
         taken: Collection[str],
         *,
-        simulated: bool = False,
+        not_real: NotReal | None = None,
     ) -> tuple[Tag, ...]:
         """Returns the tags of a device in a sheet. `path`: of the setting that names the sheet."""
         grid = self._grid(self.folder / file, path)
@@ -80,7 +81,7 @@ class SheetTags:
         for name in sheet.tags.keys() & taken:
             mistakes.add((name, "name"), f"{name} is in `tags` of {device} already")
         builder = DeviceTags(mistakes)
-        tags = builder.build(device, sheet.tags, (), defaults, driver, simulated=simulated)
+        tags = builder.build(device, sheet.tags, (), defaults, driver, not_real=not_real)
         if builder.recorded is not None and self.recorded is None:
             self.recorded = path
         self.mistakes.include(mistakes)

@@ -127,7 +127,7 @@ class _Maker:
             origin=Origin(
                 formula=Formula(source.own.computed, parsed.term, whole),
                 inputs=tuple(inputs),
-                simulated=any(one.origin.simulated for one in inputs),
+                not_real=next(filter(None, (one.origin.not_real for one in inputs)), None),
             ),
             **kept_by(source, facts),
         )

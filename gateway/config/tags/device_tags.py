@@ -16,6 +16,7 @@ from gateway.protocols.driver import Addressing, Span, Unit
 from gateway.protocols.models import Model, model_of
 from gateway.protocols.typed_fields import TypedField, TypedFields
 from gateway.tags import Origin, Tag, WriteRule
+from gateway.tags.tag import NotReal
 from gateway.values import Layout
 
 # By the text of the settings: numbers and booleans that are equal in Python are not alike.
@@ -40,12 +41,12 @@ class DeviceTags:
         defaults: TagDefaults,
         driver: Addressing | None,
         *,
-        simulated: bool = False,
+        not_real: NotReal | None = None,
     ) -> tuple[Tag, ...]:
         """Returns the tags of a device, without those that have mistakes."""
         alike: _Alike = {}
         if driver is not None:
-            kind = model_of(driver), f"{defaults!r} {simulated}"
+            kind = model_of(driver), f"{defaults!r} {not_real}"
             alike = self._built.setdefault(kind, alike)
         tags: list[Tag] = []
         seen: set[str] = set()
@@ -67,7 +68,7 @@ class DeviceTags:
             else:
                 before = len(self.mistakes)
                 tag = self._tag(device, name, raw, place, defaults, driver, fields)
-                tag = tag.as_simulated() if tag is not None and simulated else tag
+                tag = None if tag is None else tag.with_origin(not_real)
                 if tag is not None and len(self.mistakes) == before:
                     alike[text] = tag
             if tag is not None:

@@ -130,14 +130,7 @@ class ServedDevice:
         own = self._own(tag.name)
         place = ("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
-        for setting in ("debounce", "counter", "range"):
-            if own.get(setting):
-                text = f"{setting} is for values that the gateway reads: remove it here"
-                self._note((*place, setting), text)
-        if tag.origin.kept is not None:
-            tag = replace(tag, origin=tag.origin.inputs[0].origin)
-        if tag.shaping.range is not None:
-            tag = replace(tag, shaping=replace(tag.shaping, range=None))
+        tag = self._without_reads(tag, own)
         hold_last = own.get("hold_last", self.defaults.hold_last) is True
         inside = [served.takes(*cell) for cell in cells_of(tag.span)]
         accepted = any(inside)
@@ -156,13 +149,29 @@ class ServedDevice:
         if accepted and own.get("publish") != "change" and tag.publishing.deadband is None:
             each = replace(tag.publishing, publish=Publish.ALWAYS, event=True, heartbeat=None)
             tag = replace(tag, publishing=each)
+        if accepted or source is not None:
+            tag = replace(tag, write=None)
+        else:
+            tag = replace(tag, origin=replace(tag.origin, held=True))
         return Row(
-            tag=replace(tag, write=None) if accepted or source is not None else tag,
+            tag=tag,
             source=source if isinstance(source, str) else None,
             hold_last=hold_last,
             retain=retain,
             accepted=accepted,
         )
+
+    def _without_reads(self, tag: Tag, own: Mapping[str, object]) -> Tag:
+        """Returns the tag without the settings of values that the gateway reads. Notes them."""
+        for setting in ("debounce", "counter", "range"):
+            if own.get(setting):
+                text = f"{setting} is for values that the gateway reads: remove it here"
+                self._note(("tags", tag.name, setting), text)
+        if tag.origin.kept is not None:
+            tag = replace(tag, origin=tag.origin.inputs[0].origin)
+        if tag.shaping.range is not None:
+            tag = replace(tag, shaping=replace(tag.shaping, range=None))
+        return tag
 
     def _own(self, name: str) -> Mapping[str, object]:
         """Returns the settings of a tag in the file or in a sheet."""

@@ -97,8 +97,8 @@ class Ranges:
             self.mistakes.add(path, problem)
         if tag is None or len(found):
             return None
-        simulated = any(line.simulated for line in self.lines if device in line.devices)
-        return tag.as_simulated() if simulated else tag
+        origins = (line.not_real for line in self.lines if device in line.devices)
+        return tag.with_origin(next(origins, None))
 
     def added(self) -> list[LineConfig]:
         """Returns the lines with the tags of the ranges."""

@@ -183,8 +183,8 @@ class _Finder:
 
 
 def _misfits(own: TransferSection, source: Tag, target: Tag) -> Iterator[tuple[str, str]]:
-    if source.origin.simulated and not target.origin.simulated:
-        yield "from", f"{own.from_} is simulated: its values are never written to a real device"
+    if (word := source.origin.not_real) is not None and target.origin.not_real is None:
+        yield "from", f"{own.from_} is {word}: its values are never written to a real device"
     counts = source.layout.type.count, target.layout.type.count
     if counts[0] != counts[1]:
         sizes = f"{_size(own.from_, counts[0])}, and {_size(own.to, counts[1])}"

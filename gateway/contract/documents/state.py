@@ -7,6 +7,7 @@ from typing_extensions import TypedDict
 from gateway.contract.documents.values import Number, Time, words
 from gateway.engine.device.identity import Verdict
 from gateway.engine.device.records import CallState
+from gateway.tags.tag import NotReal
 from gateway.values import Value
 
 Standing = Annotated[str, words("starting", "up", "failing", "silent")]
@@ -22,6 +23,7 @@ class StatusDocument(TypedDict):
     up: float
     tags: int
     simulated: list[str]
+    replayed: list[str]
     lines: dict[str, bool]
     devices: dict[str, Standing]
     refused_devices: dict[str, str]
@@ -242,12 +244,14 @@ class StandbyDocument(TypedDict):
 
 
 class ClaimDocument(TypedDict):
-    """The devices of a gateway; `signature` if the plant has a secret."""
+    """The devices of a gateway; `signature` if the plant has a secret. `origins`: of those devices
+    that are not real."""
 
     contract: Number
     ticket: int
     group: str | None
     devices: list[str]
+    origins: NotRequired[dict[str, NotReal]]
     signature: NotRequired[str]
 
 

@@ -12,6 +12,7 @@ from gateway.northbound.group.claiming import NETWORK_WITHIN, Claiming
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.group.standby import GroupSettings, Standby
 from gateway.northbound.session.session import SecondSession
+from gateway.tags.tag import NotReal
 
 
 class Admission:
@@ -38,8 +39,9 @@ class Admission:
         self.claiming = Claiming(keys, settings.group, secret, devices, self.active, self.replaced)
         self._second = SecondSession(config)
 
-    def documents(self) -> Mapping[str, Mapping[str, object]]:
-        return {**self.standby.documents(), **self.claiming.documents()}
+    def documents(self, origins: Mapping[str, NotReal]) -> Mapping[str, Mapping[str, object]]:
+        """`origins`: of devices that are not real."""
+        return {**self.standby.documents(), **self.claiming.documents(origins)}
 
     def sessions(self) -> list[zenoh.Session]:
         """Sessions of tokens; the gateway's own may be one of them."""

@@ -5,6 +5,8 @@
 The signature covers the key too, which has the names of the gateway and of its session.
 """
 
+from collections.abc import Mapping
+
 import orjson
 import structlog
 
@@ -15,6 +17,7 @@ from gateway.contract.rate_limit import RateLimit
 from gateway.errors import BadValue
 from gateway.northbound.group.claims import LAST_TICKET, Claim
 from gateway.northbound.group.plant_secret import PlantSecret
+from gateway.tags.tag import NotReal
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -44,14 +47,17 @@ class ClaimDocuments:
         """The claim has ended."""
         self._refused.pop(key, None)
 
-    def document(self, claim: Claim) -> ClaimDocument:
-        # The number is not signed: a gateway of an earlier version does not know it.
+    def document(self, claim: Claim, origins: Mapping[str, NotReal]) -> ClaimDocument:
+        """`origins`: of devices that are not real."""
+        # Number and origins are not signed: a gateway of an earlier version does not know them.
         document: ClaimDocument = {
             "contract": CONTRACT,
             "ticket": claim.ticket,
             "group": claim.group,
             "devices": sorted(claim.devices),
         }
+        if known := {name: word for name, word in origins.items() if name in claim.devices}:
+            document["origins"] = known
         if self._secret is not None:
             text = _text(self._keys.claim(claim.session), _unsigned(claim))
             document["signature"] = self._secret.signature(text)

@@ -20,6 +20,7 @@ from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.session.session import SecondSession
 from gateway.plant.threads import off_loop
+from gateway.tags.tag import NotReal
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -87,12 +88,12 @@ class Claiming:
             await off_loop(token.undeclare)
             await self._declare(session)
 
-    def documents(self) -> dict[str, ClaimDocument]:
-        """The own claim, by its path."""
+    def documents(self, origins: Mapping[str, NotReal]) -> dict[str, ClaimDocument]:
+        """The own claim, by its path. `origins`: of devices that are not real."""
         own = None if self._claims is None else self._claims.own
         if own is None:
             return {}
-        return {f"claim/{own.session}": self._documents.document(own)}
+        return {f"claim/{own.session}": self._documents.document(own, origins)}
 
     def status(self) -> dict[str, object]:
         """The fields of the gateway's status document."""

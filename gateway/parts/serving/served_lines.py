@@ -100,7 +100,13 @@ class ServedLines:
             self._sink.samples([good(tag, real, at) for tag, real in held.items()])
         took = loop.time() - started
         return [
-            WriteResult(real, at, took, verified=tag.write is not None and tag.write.verify)
+            WriteResult(
+                real,
+                at,
+                took,
+                verified=tag.write is not None and tag.write.verify,
+                origin=tag.origin.word,
+            )
             for tag, real in held.items()
         ]
 

@@ -215,7 +215,10 @@ def _state(documents: Documents) -> dict[str, Any]:
     known, why = overview(documents), causes(documents)
     line_of = {name: line for line, one in below("lines/", documents) for name in one["devices"]}
     return {
-        **{name: known["status"][name] for name in ("name", "version", "up", "tags", "simulated")},
+        **{name: known["status"][name] for name in ("name", "version", "up", "tags")},
+        "origins": {
+            name: word for word in ("simulated", "replayed") for name in known["status"][word]
+        },
         "links": known["zenoh"]["to"],
         "history": known.get("history", {}).get("state"),
         "standby": known.get("standby", {}).get("stand"),

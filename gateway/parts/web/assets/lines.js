@@ -14,7 +14,7 @@ export const devices = new Map(); // [line, state, why] by name
 const loads = new Map();
 const transfers = new Map();
 let lines = [];
-let simulated = [];
+let origins = {}; // of lines without real devices
 let all = false; // every sentence is shown
 
 on("begin", () => {
@@ -31,7 +31,7 @@ on("state", (state) => {
   put("name", state.name);
   put("about", `plc-gateway ${state.version}, up ${span(state.up)}, ${state.tags} tags, ${state.links.length} Zenoh ${state.links.length === 1 ? "link" : "links"}, ${history}${waiting}${state.you[1] ? "" : ", read only"}`);
   lines = state.lines;
-  simulated = state.simulated;
+  origins = state.origins;
   merge(devices, state.devices);
   merge(transfers, state.transfers);
   showWrong(state);
@@ -102,7 +102,7 @@ function parted(text) {
 // -- lines --
 
 function stateOf([name, open]) {
-  return open ? (simulated.includes(name) ? "simulated" : "open") : "down";
+  return open ? (origins[name] ?? "open") : "down";
 }
 
 // Returns [kind, sentence] of each cause.
