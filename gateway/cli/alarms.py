@@ -1,8 +1,10 @@
-"""The `alarms` command: the alarms of the running gateway, and the acknowledgement of one."""
+"""The `alarms` command: the alarms of the running gateway, and the orders of operators."""
 
 import json
 import sys
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,12 +24,17 @@ from gateway.cli.terminal import (
     out,
     printable,
 )
+from gateway.config.settings import parsers
 from gateway.errors import ConfigError
 
 _ORDER = ("active", "returned", "acknowledged", "normal")
 _URGENT = ("critical", "high", "medium", "low")
 _STYLES = {"active": "red", "returned": "yellow", "acknowledged": "yellow"}
 _MISTAKES = ("bad-value", "unknown-tag")
+
+
+def _alarm(option: str, text: str) -> Any:
+    return typer.Option(option, metavar="ALARM", help=text)
 
 
 def alarms(
@@ -38,29 +45,70 @@ def alarms(
     every: Annotated[bool, typer.Option("--all", help="Also alarms that are normal.")] = False,
     ack: Annotated[
         str | None,
-        typer.Option("--ack", metavar="ALARM", help="Acknowledge device/tag, device or line:name."),
+        _alarm(
+            "--ack", "Acknowledge device/tag, device or line:name; '*' or 'mixer/*': all these."
+        ),
     ] = None,
+    shelve: Annotated[
+        str | None, _alarm("--shelve", "Shelve an alarm; with --for and --reason.")
+    ] = None,
+    unshelve: Annotated[str | None, _alarm("--unshelve", "End the shelving of an alarm.")] = None,
+    remove: Annotated[
+        str | None, _alarm("--out-of-service", "Take an alarm out of service; with --reason.")
+    ] = None,
+    put_back: Annotated[str | None, _alarm("--in-service", "Put an alarm back.")] = None,
     by: Annotated[
-        str | None, typer.Option("--by", metavar="NAME", help="Operator that acknowledges.")
+        str | None, typer.Option("--by", metavar="NAME", help="The operator who orders it.")
     ] = None,
+    for_: Annotated[
+        str | None, typer.Option("--for", metavar="TIME", help="How long, such as 2h.")
+    ] = None,
+    reason: Annotated[str | None, typer.Option(metavar="TEXT", help="Why.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the alarms that are not normal, from the running gateway, or acknowledge one."""
-    if (ack is None) is not (by is None):
-        raise ConfigError("--ack needs --by NAME, the operator that acknowledges, and --by --ack")
-    if ack is not None and ack not in (known := _known(config)):
-        raise ConfigError(f"there is no alarm {ack} in {config}{suggestion(ack, known)}")
+    """Print the alarms that are not normal, from the running gateway, or acknowledge, shelve and
+    take them out of service."""
+    orders = {
+        "acknowledge": ack,
+        "shelve": shelve,
+        "unshelve": unshelve,
+        "out-of-service": remove,
+        "in-service": put_back,
+    }
+    given = [(do, alarm) for do, alarm in orders.items() if alarm is not None]
+    if len(given) > 1 or bool(given) is not (by is not None):
+        raise ConfigError("give one of --ack, --shelve and others, with --by NAME, the operator")
+    if not given:
+        with reached(config, err.print) as client:
+            _print(client, watch=watch, every=every, as_json=as_json)
+        return
+    [(do, alarm)] = given
+    fields: dict[str, object] = {"by": by}
+    if do != "acknowledge":
+        fields["do"] = do
+    if for_ is not None:
+        fields["seconds"] = parsers.duration(for_)
+    if reason is not None:
+        fields["reason"] = reason
+    is_pattern = do == "acknowledge" and "*" in alarm
+    if not is_pattern and alarm not in (known := _known(config)):
+        raise ConfigError(f"there is no alarm {alarm} in {config}{suggestion(alarm, known)}")
     with reached(config, err.print) as client:
-        if ack is not None and by is not None:
-            _acknowledge(client, ack, by, as_json=as_json)
-        elif watch and not as_json:
-            repeated(lambda: view(_alarms(client, every=every)))
-        else:
-            found = _alarms(client, every=every)
-            if as_json:
-                print(json.dumps(found))
-            else:
-                out.print(view(found))
+        if is_pattern:
+            _acknowledge_all(client, alarm, fields, as_json=as_json)
+        elif problem := _order(client, alarm, fields, as_json=as_json):
+            sys.exit(USER_MISTAKE if problem in _MISTAKES else FAILED)
+
+
+def _print(client: Client, *, watch: bool, every: bool, as_json: bool) -> None:
+    if watch and not as_json:
+        repeated(lambda: view(_alarms(client, every=every)))
+        return
+    found = _alarms(client, every=every)
+    if as_json:
+        print(json.dumps(found))
+    else:
+        out.print(view(found))
 
 
 def _known(path: Path) -> dict[str, None]:
@@ -77,25 +125,50 @@ def _known(path: Path) -> dict[str, None]:
 
 
 def _alarms(client: Client, *, every: bool) -> list[dict[str, Any]]:
-    found = [one for one in client.alarms() if every or one["state"] != "normal"]
+    found = [one for one in client.alarms() if every or one["state"] != "normal" or _rest(one)]
     # Of one state and priority the newest first.
     found.sort(key=lambda one: str(one["since"]), reverse=True)
     found.sort(key=lambda one: _URGENT.index(one.get("priority", "medium")))
     return sorted(found, key=lambda one: _ORDER.index(one["state"]))
 
 
-def _acknowledge(client: Client, alarm: str, by: str, *, as_json: bool) -> None:
-    answer = client.acknowledge(alarm, by)
+def _rest(one: dict[str, Any]) -> str:
+    """Returns who shelved the alarm or took it out of service, and why; empty: nobody."""
+    if what := one.get("shelved"):
+        return f"shelved until {_moment(what['until'])} by {what['by']}: {what['reason']}"
+    if what := one.get("out_of_service"):
+        return f"out of service by {what['by']}: {what['reason']}"
+    return ""
+
+
+def _acknowledge_all(
+    client: Client, pattern: str, fields: dict[str, object], *, as_json: bool
+) -> None:
+    """Acknowledges each alarm as it is now: one that is raised again meanwhile stays active."""
+    open_ones = [one for one in client.alarms() if one["state"] in ("active", "returned")]
+    found = [one for one in open_ones if fnmatchcase(one["alarm"], pattern)]
+    orders = ((one["alarm"], fields | {"raised": one["raised"]}) for one in found)
+    failed = [alarm for alarm, order in orders if _order(client, alarm, order, as_json=as_json)]
+    if not as_json:
+        print(f"{len(found) - len(failed)} of {len(found)} alarms acknowledged")
+    if failed:
+        sys.exit(FAILED)
+
+
+def _order(client: Client, alarm: str, fields: dict[str, object], *, as_json: bool) -> str:
+    """Sends an order, and prints its answer. Returns the error word; empty: it is done."""
+    answer = client.order(alarm, fields)
     if as_json:
         print(json.dumps(answer))
     if "error" in answer:
         if not as_json:
             err.print(printable(f"{answer['error']}: {answer['reason']}"), style="red")
-        sys.exit(USER_MISTAKE if answer["error"] in _MISTAKES else FAILED)
+        return str(answer["error"])
     if not as_json:
-        known: Any = answer["acknowledged"]
-        text = f"{alarm}: acknowledged by {known['by']} at {known['time']}, now {answer['state']}"
-        print(printable(text))
+        known: Any = answer["acknowledged"] if "do" not in fields else None
+        done = known and f"acknowledged by {known['by']} at {known['time']}, now {answer['state']}"
+        print(printable(f"{alarm}: {done or _rest(answer) or answer['state']}"))
+    return ""
 
 
 def view(found: Sequence[dict[str, Any]]) -> RenderableType:
@@ -119,17 +192,27 @@ def view(found: Sequence[dict[str, Any]]) -> RenderableType:
         by = one["acknowledged"]
         part = f"part of {one['part_of']}" if "part_of" in one else ""
         texts = (one["text"], part or (one.get("detail", "") if one["value"] is True else ""))
+        rest = _rest(one)
         table.add_row(
             Text(printable(one["alarm"])),
             Text(one.get("priority", "")),
-            Text(one["state"], style=_STYLES.get(one["state"], "")),
+            Text(_state(one), style=_STYLES.get(one["state"], "")),
             Text(f"{one['level'] or ''}{limit}"),
             Text(printable(_value(one)), style="" if one["quality"] == "good" else "red"),
-            Text(str(one["since"] or "")[:19].replace("T", " ")),
+            Text(_moment(one["since"] or "")),
             Text(printable("" if by is None else by["by"])),
-            Text(printable(": ".join(text for text in texts if text))),
+            Text(printable(rest or ": ".join(text for text in texts if text))),
         )
     return table
+
+
+def _state(one: dict[str, Any]) -> str:
+    suppressed = "shelved" in one, "out_of_service" in one
+    return next(compress(("shelved", "out of service"), suppressed), str(one["state"]))
+
+
+def _moment(time: str) -> str:
+    return time[:19].replace("T", " ")
 
 
 def _value(one: dict[str, Any]) -> str:

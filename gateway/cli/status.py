@@ -196,7 +196,7 @@ def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Ta
         table.add_row("file", Text(printable(f"of {reload['loaded'][:19]}Z{again}")))
     if alarms := documents.get("alarms"):
         text = ", ".join(f"{n} {state}" for state, n in alarms.items() if n and state != "normal")
-        table.add_row("alarms", Text(text or "none"))
+        table.add_row("alarms", Text(text.replace("_", " ") or "none"))
     if outcomes is not None:
         known = Counter(str(outcome.get("outcome")) for outcome in outcomes)
         text = ", ".join(f"{number} {outcome}" for outcome, number in known.most_common())

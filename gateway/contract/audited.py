@@ -7,11 +7,14 @@ leaves out (`northbound/requests/audit.py`).
 WRITTEN, EXECUTED = "tag written", "command executed"
 WRITE_FAILED, WRITE_UNCLEAR = "write failed", "write unclear"
 COMMAND_FAILED, COMMAND_UNCLEAR = "command failed", "command unclear"
-ACKNOWLEDGED = "alarm acknowledged"
+OF_ALARMS = tuple(
+    f"alarm {deed}"
+    for deed in ("acknowledged", "shelved", "unshelved", "out of service", "in service")
+)
 EVENTS = frozenset(
     {
         *(WRITTEN, WRITE_FAILED, WRITE_UNCLEAR),
         *(EXECUTED, COMMAND_FAILED, COMMAND_UNCLEAR),
-        ACKNOWLEDGED,
+        *OF_ALARMS,
     }
 )

@@ -65,7 +65,14 @@ async def test_a_delay_ends_although_the_value_is_sent_once() -> None:
     assert board.state() is State.NORMAL
     await asyncio.sleep(0.2)
     assert board.state() is State.ACTIVE
-    assert board.alarms.counts() == {"normal": 0, "active": 1, "acknowledged": 0, "returned": 0}
+    assert board.alarms.counts() == {
+        "normal": 0,
+        "active": 1,
+        "acknowledged": 0,
+        "returned": 0,
+        "shelved": 0,
+        "out_of_service": 0,
+    }
 
 
 @on_virtual_time

@@ -28,7 +28,7 @@ from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.group.standby import GroupTokens
 from gateway.northbound.requests.acceptance import Acceptance, AcceptedUntil, Sender
 from gateway.parts.alarms import file as alarm_file
-from gateway.parts.alarms.part import parse_acknowledgement
+from gateway.parts.alarms.orders import parse_order
 from gateway.parts.audit.file import Event, checked, lines, link, within
 from gateway.parts.history.files import aside
 from gateway.parts.recording.wire_file import entries
@@ -120,8 +120,9 @@ def token(data: bytes) -> None:
 
 def acknowledgement(data: bytes) -> None:
     with suppress(BadValue):
-        by, _ = parse_acknowledgement(data)
-        assert by.isprintable()
+        order = parse_order(data, 3600.0)
+        assert order.by.isprintable()
+        assert 0 <= order.seconds <= 3600
 
 
 def key(data: bytes) -> None:

@@ -16,8 +16,8 @@ from gateway.line.send_permit import Duty
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.commands import Orders
+from gateway.parts.alarms.documents import open_alarms
 from gateway.parts.alarms.machine import State
-from gateway.parts.alarms.part import open_alarms
 from gateway.tags import AlarmRule, Level, Reason, bad, good
 from gateway.tags.timestamps import rfc3339
 from tests.northbound.plant import PlainDevice, PlainPlant, gateway_and_client, tag

@@ -65,7 +65,7 @@ def test_every_entry_of_an_outcome_is_known_as_audited() -> None:
         for result in [*ends, *(Failure(problem, "why") for problem in Problem)]:
             for command in (False, True):
                 audit(replace(outcome(result), command=command))
-    assert {line["event"] for line in lines} == audited.EVENTS - {audited.ACKNOWLEDGED}
+    assert {line["event"] for line in lines} == audited.EVENTS - {*audited.OF_ALARMS}
 
 
 def test_a_rate_limit_allows_a_burst_and_then_one_per_interval() -> None:

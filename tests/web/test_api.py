@@ -304,9 +304,31 @@ async def test_alarms_are_listed_in_pages() -> None:
         second = (await client.ask(f"/api/alarms?limit=1&after={first['next']}")).json
         both = {one["alarm"] for page in (first, second) for one in page["alarms"]}
         assert (both, second["next"]) == ({"mixer/speed", "mixer/level"}, None)
-        assert first["counts"] == {"normal": 1, "active": 2, "acknowledged": 0, "returned": 0}
+        assert first["counts"] == {
+            "normal": 1,
+            "active": 2,
+            "acknowledged": 0,
+            "returned": 0,
+            "shelved": 0,
+            "out_of_service": 0,
+        }
         assert violations(first, schema("/api/alarms", 200)) == []
         assert len((await client.ask("/api/alarms?state=all")).json["alarms"]) == 3
+
+
+async def test_an_alarm_is_shelved_and_listed_as_such(tokens: Path) -> None:
+    body = b'{"by": "Ana", "do": "shelve", "reason": "broken", "seconds": 60}'
+    path = "/api/alarms/order?alarm=mixer/speed"
+    async with serving(plant=alarmed(), tokens_file=tokens) as client:
+        client.north.orders = client.plant.parts.alarms.order
+        assert (await client.ask(path, "POST", body, Content_Type="application/json")).status == 401
+        done = await client.ask(path, "POST", body, **AS_JSON)
+        assert (done.status, done.json["shelved"]["reason"]) == (200, "broken")
+        assert violations(done.json, schema("/api/alarms/order", 200, "post")) == []
+        found = (
+            await client.ask("/api/alarms?state=suppressed", Authorization=AS_JSON["Authorization"])
+        ).json["alarms"]
+        assert [one["alarm"] for one in found] == ["mixer/speed"]
 
 
 async def test_an_alarm_is_acknowledged_with_a_token_only(tokens: Path) -> None:

@@ -1,7 +1,7 @@
 """The client of a running gateway: reads, writes, follows."""
 
 import json
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from itertools import pairwise
@@ -120,11 +120,11 @@ class Client:
             self.status()  # a gateway may have no alarms
         return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
-    def acknowledge(self, alarm: str, by: str) -> dict[str, object]:
+    def order(self, alarm: str, order: Mapping[str, object]) -> dict[str, object]:
         """Returns the document of the alarm, or `error ...`. Raises as `write`."""
         key = self._keys.status(f"alarms/{alarm}")
         status = self._keys.status("status")
-        return self._request(key, json.dumps({"by": by}).encode(), status)
+        return self._request(key, json.dumps(order).encode(), status)
 
     def trace(self, line: str, until: float | None) -> Iterator[dict[str, Any]]:
         """Yields the trace of a line, in parts. Raises `GatewayError` if nobody serves it."""

@@ -98,6 +98,16 @@ class Acknowledgement(TypedDict):
     via: str | None
 
 
+class Suppressed(TypedDict):
+    """Who shelved the alarm, or took it out of service, and why; `until`: of a shelved one."""
+
+    by: str
+    time: Time
+    reason: str
+    via: str | None
+    until: NotRequired[Time]
+
+
 class AlarmDocument(TypedDict):
     """An alarm, and the value now."""
 
@@ -121,12 +131,20 @@ class AlarmDocument(TypedDict):
     priority: NotRequired[Annotated[Priority, words(*Priority)]]
     devices: NotRequired[list[str]]
     part_of: NotRequired[str]
+    shelved: NotRequired[Suppressed]
+    out_of_service: NotRequired[Suppressed]
+
+
+_CHANGES = "folded", "unfolded", "shelved", "unshelved", "out of service", "in service"
 
 
 class AlarmEvent(AlarmDocument):
-    """A change of an alarm."""
+    """A change of an alarm. `change`: what happened, if `event` says only what follows from it."""
 
     event: Literal["raised", "eased", "ended", "acknowledged"]
+    change: NotRequired[Annotated[str, words(*_CHANGES)]]
+    by: NotRequired[str | None]
+    via: NotRequired[str | None]
 
 
 class AuditNote(TypedDict):
@@ -184,7 +202,10 @@ GroupRequest = dict[str, WriteRequest]  # by tag, in their order
 
 
 class AcknowledgeRequest(TypedDict):
-    """The operator, and the `raised` that the operator saw."""
+    """The operator, and the `raised` that the operator saw; with `do`, another order."""
 
     by: str
     raised: NotRequired[str | None]
+    do: NotRequired[Literal["acknowledge", "shelve", "unshelve", "out-of-service", "in-service"]]
+    reason: NotRequired[str]
+    seconds: NotRequired[float]

@@ -166,6 +166,8 @@ class AlarmCounts(TypedDict):
     active: int
     acknowledged: int
     returned: int
+    shelved: NotRequired[int]
+    out_of_service: NotRequired[int]
 
 
 class PartDocument(TypedDict):

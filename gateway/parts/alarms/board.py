@@ -12,9 +12,16 @@ from dataclasses import dataclass
 
 import structlog
 
-from gateway.contract import audited
 from gateway.errors import NothingToAcknowledge
-from gateway.parts.alarms.machine import IN_ALARM, Alarm, Event, State, Status
+from gateway.parts.alarms.machine import (
+    IN_ALARM,
+    Acknowledgement,
+    Alarm,
+    Event,
+    State,
+    Status,
+    Suppression,
+)
 from gateway.plant.doors import Condition, Reading
 from gateway.tags import AlarmRule, Level, Quality, Sample, Tag
 from gateway.tags.scan import Scan
@@ -22,6 +29,8 @@ from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
 
+# What operators do.
+AUDITED = (Event.ACKNOWLEDGED, Event.SHELVED, Event.UNSHELVED, Event.REMOVED, Event.PUT_BACK)
 # Seconds after the end of an alarm until its parts are alarms of their own again: the devices of a
 # line that is back reply one after the other.
 OWN_AFTER = 10.0
@@ -40,6 +49,8 @@ class Entry:
     reading: Reading = _UNKNOWN  # what it returned last
     parent: str = ""  # the alarm of which it may be a part
     own_from: float = -math.inf  # it is no part from then on, by the loop's clock
+    released_at: float = math.inf  # the end of its shelving, by the loop's clock
+    by: Acknowledgement | None = None  # who put it back; None: the time did
     counted: State = State.NORMAL
     timer: asyncio.TimerHandle | None = None  # of the delay
 
@@ -52,9 +63,23 @@ class Entry:
         return self.status.state in IN_ALARM
 
     @property
+    def covers(self) -> bool:
+        """True while the devices of a line are part of its alarm, also of a shelved one."""
+        return self.in_alarm or (self.alarm.is_suppressed and self.alarm.reached is not None)
+
+    @property
     def part_of(self) -> str:
         """The key of the alarm that it is a part of; empty: it is one of its own."""
         return self.parent if self.alarm.is_part and self.reading.alarm is not False else ""
+
+    def operator(self, event: Event) -> Acknowledgement | Suppression | None:
+        """Returns who did what `event` says; None: the end of a shelving by time, and others."""
+        match event:
+            case Event.ACKNOWLEDGED:
+                return self.status.acknowledged
+            case Event.SHELVED | Event.REMOVED:
+                return self.status.suppressed
+        return self.by if event in AUDITED else None
 
     @property
     def text(self) -> str:
@@ -89,13 +114,15 @@ class Alarms:
     def watch(self, conditions: Mapping[str, Condition]) -> None:
         """Has one alarm for each condition, and none for others."""
         for entry in [*self._watched]:
-            same = entry.key in conditions and conditions[entry.key].rule == entry.alarm.rule
-            if not same:
+            if entry.key not in conditions:
                 self._watched.remove(entry)
                 self._remove(entry)
         for key, condition in conditions.items():
-            if (known := self.entries.get(key)) is None:
-                known = self._add(Entry(key, Alarm(condition.rule)))
+            known = self.entries.get(key)
+            if known is None or known.alarm.rule != condition.rule:
+                if known is not None:
+                    self._watched.remove(known)
+                known = self._renew(key, condition.rule)
                 self._watched.append(known)
             known.look = condition.look  # another line or device may have its place
             known.parent = condition.parent
@@ -113,9 +140,7 @@ class Alarms:
                 continue
             entry = self.entries.get(tag.key)
             if entry is None or entry.tag is None or entry.tag.feature(AlarmRule) != rule:
-                if entry is not None:
-                    self._remove(entry)
-                entry = self._add(Entry(tag.key, Alarm(rule), tag))
+                entry = self._renew(tag.key, rule)
             entry.tag = tag
             self._by_tag[tag] = entry
         for tag in gone:
@@ -134,6 +159,17 @@ class Alarms:
             self._counts[entry.counted] -= 1
             self.changed.set()
 
+    def _renew(self, key: str, rule: AlarmRule) -> Entry:
+        """Replaces an alarm by one with another rule. It stays shelved, or out of service."""
+        old, new = self.entries.get(key), Entry(key, Alarm(rule))
+        if old is not None:
+            self._remove(old)
+            if (what := old.status.suppressed) is not None:
+                new.alarm.status, new.released_at = Status(suppressed=what), old.released_at
+        self._add(new)
+        self._count(new)
+        return new
+
     def _add(self, entry: Entry) -> Entry:
         self.entries[entry.key] = entry
         self._counts[State.NORMAL] += 1
@@ -143,8 +179,13 @@ class Alarms:
         self._sinks.append(sink)
 
     def counts(self) -> Mapping[str, int]:
-        """The status document: alarms by state."""
-        return {state.value: self._counts[state] for state in State}
+        """The status document: alarms by state, and how many of the normal ones are suppressed."""
+        ends = [one.status.suppressed for one in self.kept()]
+        return {
+            **{state.value: self._counts[state] for state in State},
+            "shelved": sum(what is not None and what.until is not None for what in ends),
+            "out_of_service": sum(what is not None and what.until is None for what in ends),
+        }
 
     # -- from the lines --
 
@@ -214,7 +255,7 @@ class Alarms:
         self._counts[entry.counted] += 1
         for found, belongs in (
             (self.open, entry.counted is not State.NORMAL),
-            (self._kept, entry.counted is not State.NORMAL or entry.status.folded),
+            (self._kept, entry.counted is not State.NORMAL or entry.alarm.is_kept),
         ):
             if belongs:
                 found[entry.key] = entry
@@ -232,11 +273,29 @@ class Alarms:
         try:
             event = entry.alarm.acknowledge(by, self._wall(), via, raised)
         except NothingToAcknowledge as error:
-            why = f"it is part of {entry.part_of}: acknowledge that" if entry.part_of else error
+            why = error
+            if entry.status.suppressed is not None:
+                why = NothingToAcknowledge("it is shelved, or out of service")
+            elif entry.part_of:
+                why = NothingToAcknowledge(f"it is part of {entry.part_of}: acknowledge that")
             raise NothingToAcknowledge(f"alarm {key}: {why}") from None
         if event is not None:
             self._report(entry, event)
         return entry
+
+    def suppress(self, entry: Entry, what: Suppression, seconds: float = math.inf) -> None:
+        """Shelves an alarm for so long, or takes it out of service."""
+        event = entry.alarm.suppress(what)
+        entry.released_at = asyncio.get_running_loop().time() + seconds
+        self._report(entry, event)
+
+    def release(self, entry: Entry, by: Acknowledgement | None = None) -> None:
+        """Puts an alarm back; `by` None: its time has ended. A repeat changes nothing."""
+        now, at = asyncio.get_running_loop().time(), self._wall()
+        entry.released_at, entry.by = math.inf, by
+        for event in (entry.alarm.release(at), entry.alarm.elapse(now, at)):
+            if event is not None:
+                self._report(entry, event)
 
     # -- life --
 
@@ -248,12 +307,19 @@ class Alarms:
                 self._count(entry)
                 if entry.alarm.is_part:
                     entry.own_from = asyncio.get_running_loop().time() + OWN_AFTER
+                if (what := status.suppressed) is not None and what.until is not None:
+                    left = max(0, min(what.until - self._wall(), what.until - what.time))
+                    entry.released_at = asyncio.get_running_loop().time() + left / 1e9
             else:
                 log.info("alarm left out", alarm=key, why="the configuration has no such alarm")
 
     def statuses(self) -> Mapping[str, Status]:
         """Returns the alarms that a restart must not lose."""
         return {key: entry.status for key, entry in self._kept.items()}
+
+    def kept(self) -> list[Entry]:
+        """Returns those alarms. Any thread may call it."""
+        return list(self._kept.values())
 
     def level(self, key: str) -> Level | None:
         """Returns the level of an alarm that is reached now."""
@@ -264,12 +330,12 @@ class Alarms:
 
     def parts(self, parent: Entry) -> list[Entry]:
         """Returns the alarms that are a part of an active one."""
-        found = self._parts.get(parent.key, ()) if parent.in_alarm else ()
+        found = self._parts.get(parent.key, ()) if parent.covers else ()
         return [one for one in found if one.reading.alarm is not False]
 
     def _fold(self, entry: Entry) -> None:
         now, parent = asyncio.get_running_loop().time(), self.entries.get(entry.parent)
-        if parent is not None and parent.in_alarm:
+        if parent is not None and parent.covers:
             entry.own_from = now + OWN_AFTER
         returns = entry.reading.alarm is False and entry.alarm.reached is not None
         if now < entry.own_from or (returns and entry.alarm.is_part):
@@ -281,6 +347,9 @@ class Alarms:
 
     def look(self) -> None:
         """Looks at the conditions."""
+        now = asyncio.get_running_loop().time()
+        for entry in [one for one in self.kept() if one.released_at <= now]:
+            self.release(entry)
         for entry in self._watched:
             self._look(entry)
 
@@ -306,9 +375,10 @@ class Alarms:
 def _log(entry: Entry, event: Event) -> None:
     status = entry.status
     fields: dict[str, object] = {"alarm": entry.key, "state": status.state.value}
-    if event is Event.ACKNOWLEDGED and status.acknowledged is not None:
-        by = status.acknowledged
-        log.info(audited.ACKNOWLEDGED, **fields, by=by.by, via=by.via)
+    if event in AUDITED:
+        by = entry.operator(event)
+        reason = {"reason": status.suppressed.reason} if status.suppressed is not None else {}
+        log.info(f"alarm {event.value}", **fields, by=by and by.by, via=by and by.via, **reason)
         return
     fields["text"] = entry.text
     if entry.tag is not None:

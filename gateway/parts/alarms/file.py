@@ -11,7 +11,7 @@ import structlog
 
 from gateway.errors import Busy, GatewayError
 from gateway.parts.alarms.board import Alarms
-from gateway.parts.alarms.machine import Acknowledgement, State, Status
+from gateway.parts.alarms.machine import Acknowledgement, State, Status, Suppression
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
 from gateway.tags import Level
@@ -114,6 +114,7 @@ def snapshot(statuses: Mapping[str, Status]) -> bytes:
             **status._asdict(),
             "value": _plain(status.value),
             "acknowledged": status.acknowledged and status.acknowledged._asdict(),
+            "suppressed": status.suppressed and status.suppressed._asdict(),
         }
         for key, status in statuses.items()
     }
@@ -140,6 +141,20 @@ def _status(entry: Mapping[str, Any]) -> Status:
         if by is None
         else Acknowledgement(str(by["by"]), _time(by["time"]), by["via"]),
         folded=entry.get("folded") is True,
+        suppressed=_suppression(entry.get("suppressed")),
+    )
+
+
+def _suppression(known: Mapping[str, Any] | None) -> Suppression | None:
+    if known is None:
+        return None
+    until = known["until"]
+    return Suppression(
+        str(known["by"]),
+        _time(known["time"]),
+        str(known["reason"]),
+        None if until is None else _time(until),
+        known["via"],
     )
 
 

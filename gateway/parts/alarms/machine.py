@@ -34,6 +34,10 @@ class Event(StrEnum):
     ACKNOWLEDGED = "acknowledged"
     FOLDED = "folded"  # it is part of another alarm now
     UNFOLDED = "unfolded"  # it is one of its own again, and was acknowledged before
+    SHELVED = "shelved"
+    UNSHELVED = "unshelved"
+    REMOVED = "out of service"
+    PUT_BACK = "in service"
 
 
 _S, _E = State, Event
@@ -51,6 +55,7 @@ TRANSITIONS: Mapping[tuple[State, Event], State] = {
     (_S.ACTIVE, _E.FOLDED): _S.NORMAL,
     (_S.ACKNOWLEDGED, _E.FOLDED): _S.NORMAL,
     (_S.NORMAL, _E.UNFOLDED): _S.ACKNOWLEDGED,
+    **{(state, event): _S.NORMAL for state in State for event in (_E.SHELVED, _E.REMOVED)},
 }
 IN_ALARM = (State.ACTIVE, State.ACKNOWLEDGED)  # a limit is reached
 UNACKNOWLEDGED = (State.ACTIVE, State.RETURNED)
@@ -61,6 +66,17 @@ class Acknowledgement(NamedTuple):
 
     by: str
     time: int  # ns since 1970
+    via: str | None = None
+
+
+class Suppression(NamedTuple):
+    """An alarm that an operator has shelved, or taken out of service: it is judged, and raises
+    nothing. `until`: ns since 1970; None: until it is put back, out of service."""
+
+    by: str
+    time: int  # ns since 1970
+    reason: str
+    until: int | None = None
     via: str | None = None
 
 
@@ -78,6 +94,7 @@ class Status(NamedTuple):
     value: Value | None = None  # at the last event
     acknowledged: Acknowledgement | None = None  # of the last event `raised`
     folded: bool = False  # it would be active or acknowledged, if it was no part of another alarm
+    suppressed: Suppression | None = None
 
 
 class _Condition:
@@ -182,7 +199,7 @@ class Alarm:
         was_in_alarm = before.state in IN_ALARM
         if before.folded and level is None:
             self.status = before = before._replace(folded=False, level=None)
-        if self.is_part or level is (before.level if was_in_alarm else None):
+        if self.is_suppressed or level is (before.level if was_in_alarm else None):
             return None
         event = Event.ENDED
         if level is not None and before.folded and before.acknowledged is not None:
@@ -197,6 +214,31 @@ class Alarm:
             changed = changed._replace(level=level)
         self.status = changed
         return event
+
+    @property
+    def is_kept(self) -> bool:
+        """True if a normal alarm has more than its state."""
+        return self.status.folded or self.status.suppressed is not None
+
+    @property
+    def is_suppressed(self) -> bool:
+        return self.is_part or self.status.suppressed is not None
+
+    def suppress(self, what: Suppression) -> Event:
+        """Shelves it, or takes it out of service."""
+        event = Event.REMOVED if what.until is None else Event.SHELVED
+        state = TRANSITIONS[self.status.state, event]
+        known = self.status._replace(state=state, level=None, folded=False)
+        self.status = known._replace(since=what.time, value=self.value, suppressed=what)
+        return event
+
+    def release(self, time: int) -> Event | None:
+        """Puts it back. Call `elapse` after it: a limit that is reached raises it again."""
+        was = self.status.suppressed
+        if was is None:
+            return None
+        self.status = self.status._replace(suppressed=None, since=time)
+        return Event.PUT_BACK if was.until is None else Event.UNSHELVED
 
     def fold(self, time: int) -> Event | None:
         """Makes it part of another alarm, until `unfold`. Its acknowledgement is kept."""

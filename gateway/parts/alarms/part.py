@@ -1,6 +1,7 @@
 """The alarms as a part: judged with each read, kept in a file, published and acknowledged."""
 
 import asyncio
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
@@ -12,19 +13,26 @@ from gateway.config import Config
 from gateway.contract import payload
 from gateway.contract.interfaces import Keyed
 from gateway.errors import BadValue, Busy, NoHistory, Unknown
-from gateway.parts.alarms.board import Alarms, Entry
+from gateway.parts.alarms.board import AUDITED, Alarms, Entry
+from gateway.parts.alarms.documents import (
+    alarm_fields,
+    event_fields,
+    open_alarms,
+    suppressed_alarms,
+)
 from gateway.parts.alarms.file import AlarmFile
-from gateway.parts.alarms.machine import Event, State
+from gateway.parts.alarms.machine import Acknowledgement, Event, State, Suppression
+from gateway.parts.alarms.orders import Do, Order, parse_order
 from gateway.parts.alarms.settings import AlarmsSection
 from gateway.parts.alarms.watched import conditions, tuned
 from gateway.plant.part import Audits, Core, Kind
-from gateway.tags import Level, Priority, Quality, Sample, Tag
+from gateway.tags import Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
-from gateway.values import Value
 
 LOOK_EVERY = 1.0  # seconds between two looks at the conditions
 MOST_SHOWN = 50  # on the status page
+STATES = ("open", "suppressed", "all", *State)  # of a list
 _BATCH_SIZE = 500  # alarms in one turn of the loop
 
 
@@ -97,9 +105,8 @@ class AlarmPart:
         self._publish(entry)
         if event is None:
             return
-        fields = {"event": _TOLD.get(event, event), **self._fields(entry)}
-        changed = payload.document(fields).decode()
-        if event is Event.ACKNOWLEDGED:
+        changed = payload.document(event_fields(entry, event, self._fields(entry))).decode()
+        if event in AUDITED:
             for part in self._core.others.each(Audits):
                 part.audit(self._plant.wall(), changed)
         try:
@@ -133,29 +140,47 @@ class AlarmPart:
     # -- operators --
 
     async def order(self, path: str, data: bytes, by: str | None) -> bytes:
-        """Acknowledges an alarm, and returns when that is on disk.
+        """Does what an operator orders, and returns when that is on disk.
 
         Raises `BadValue`, `Unknown`, `NothingToAcknowledge`, and `Busy` if it counts until the next
         restart only. A repeat waits for the disk again.
         """
-        name, raised = parse_acknowledgement(data)
+        order = parse_order(data, self._settings.shelve_at_most)
         entry = self.alarms.entries.get(path)
         if entry is None:
             raise Unknown(f"there is no alarm {payload.short(path)}")
-        seen = entry.status.raised
-        if raised is not None and raised != rfc3339(seen):
-            seen = -1
-        self.alarms.acknowledge(entry.key, name, by, None if raised is None else seen)
+        self._do(order, entry, by)
         await self._file.keep()
         return self.document(entry)
+
+    def _do(self, order: Order, entry: Entry, via: str | None) -> None:
+        at, what = self._plant.wall(), entry.status.suppressed
+        match order.do:
+            case Do.ACKNOWLEDGE:
+                seen = None if order.raised is None else entry.status.raised
+                if seen is not None and order.raised != rfc3339(seen):
+                    seen = -1
+                self.alarms.acknowledge(entry.key, order.by, via, seen)
+            case Do.SHELVE | Do.OUT_OF_SERVICE:
+                is_shelf = order.do is Do.SHELVE
+                until = at + round(order.seconds * 1e9) if is_shelf else None
+                asked = Suppression(order.by, at, order.reason, until, via)
+                self.alarms.suppress(entry, asked, order.seconds if is_shelf else math.inf)
+            case Do.UNSHELVE if what is not None and what.until is None:
+                raise BadValue(f"alarm {entry.key} is out of service: send do: {Do.IN_SERVICE}")
+            case Do.IN_SERVICE if what is not None and what.until is not None:
+                raise BadValue(f"alarm {entry.key} is shelved: send do: {Do.UNSHELVE}")
+            case _:
+                self.alarms.release(entry, Acknowledgement(order.by, at, via))
 
     def page(self, state: str, after: str | None, most: int) -> Mapping[str, Any]:
         """Returns a page of the list, after the alarm `after`. Any thread may call it.
 
-        `state`: one of `State`, `open` for all that are not normal, or `all`. Raises `BadValue`.
+        `state`: one of `State`, `open` for all that are not normal, `suppressed` for those that
+        are shelved or out of service, or `all`. Raises `BadValue`.
         """
-        if state not in ("open", "all", *State):
-            raise BadValue(f"state is none of open, all, {', '.join(State)}")
+        if state not in STATES:
+            raise BadValue(f"state is none of {', '.join(STATES)}")
         found = self._select(state)
         if after is not None:
             keys = [entry.key for entry in found]
@@ -169,6 +194,8 @@ class AlarmPart:
     def _select(self, state: str) -> list[Entry]:
         if state == "open":
             return open_alarms(self.alarms)
+        if state == "suppressed":
+            return suppressed_alarms(self.alarms)
         entries = list(self.alarms.entries.values())
         return [one for one in entries if state in ("all", one.status.state.value)]
 
@@ -176,90 +203,10 @@ class AlarmPart:
         """Returns the first alarms that are not normal."""
         found = open_alarms(self.alarms)
         shown = [self._fields(entry) for entry in found[:MOST_SHOWN]]
-        return {"alarms": {"shown": shown, "more": max(0, len(found) - MOST_SHOWN)}}
+        rest = suppressed_alarms(self.alarms)
+        suppressed = [self._fields(entry) for entry in rest[:MOST_SHOWN]]
+        more = max(0, len(found) - MOST_SHOWN)
+        return {"alarms": {"shown": shown, "more": more, "suppressed": suppressed}}
 
 
 KIND = Kind(AlarmPart, serves=Keyed)
-
-
-LONGEST_NAME = 100  # characters of an operator's name
-_LONGEST = 2000  # bytes of an acknowledgement
-_OF_BITS = {Level.ON: True, Level.OFF: False}
-_WATCHED = (Level.OFFLINE, Level.DOWN, Level.SILENT, Level.STOPPED)
-# In the documents a part has ended, with `part_of`.
-_TOLD = {Event.FOLDED: Event.ENDED, Event.UNFOLDED: Event.RAISED}
-_URGENT = [*Priority]
-# The first alarms of a list: those that nobody has acknowledged.
-_ORDER = {State.ACTIVE: 0, State.RETURNED: 1, State.ACKNOWLEDGED: 2, State.NORMAL: 3}
-
-
-def alarm_fields(
-    entry: Entry, sample: Callable[[Tag], Sample], parts: Sequence[Entry] = ()
-) -> dict[str, object]:
-    """Returns the document of an alarm. Any thread may call it."""
-    status = entry.status
-    level = None if status.state is State.NORMAL else status.level
-    at_change: Value | None = status.value
-    if entry.tag is not None:
-        known: dict[str, object] = {**payload.sample_fields(sample(entry.tag))}
-    else:
-        alarm, why = entry.reading
-        quality = Quality.BAD if alarm is None else Quality.GOOD
-        value = None if alarm is None else bool(alarm)
-        known = {"value": value, "quality": quality.value, **({"detail": why} if why else {})}
-        at_change = None if at_change is None else bool(at_change)
-    by = status.acknowledged
-    return {
-        "alarm": entry.key,
-        "state": status.state.value,
-        "level": None if level is None else level.value,
-        "limit": _limit(entry, level),
-        **known,
-        "value_at_change": payload.loggable(at_change),
-        "unit": "" if entry.tag is None else entry.tag.label.unit,
-        "since": rfc3339(status.since) if status.since else None,
-        "raised": rfc3339(status.raised) if status.raised else None,
-        "acknowledged": by and {"by": by.by, "time": rfc3339(by.time), "via": by.via},
-        "text": entry.text,
-        "priority": entry.alarm.rule.priority.value,
-        **({"part_of": entry.part_of} if entry.part_of else {}),
-        **({"devices": [part.key for part in parts]} if parts else {}),
-    }
-
-
-def _limit(entry: Entry, level: Level | None) -> float | bool | None:
-    if level is None or level in _WATCHED:
-        return None
-    return _OF_BITS.get(level, entry.alarm.rule.limits.get(level))
-
-
-def open_alarms(alarms: Alarms) -> list[Entry]:
-    """Returns the alarms that are not normal: those without acknowledgement first, then by
-    priority, then the newest."""
-
-    def place(entry: Entry) -> tuple[int, int, int]:
-        status, urgent = entry.status, _URGENT.index(entry.alarm.rule.priority)
-        return _ORDER[status.state], urgent, -status.since
-
-    return sorted(alarms.open.values(), key=place)
-
-
-def parse_acknowledgement(data: bytes) -> tuple[str, str | None]:
-    """Returns the operator's name, and the `raised` that the operator saw. Raises `BadValue`."""
-    meant = 'send {"by": "the operator\'s name"}'
-    if len(data) > _LONGEST:
-        raise BadValue(f"the payload has {len(data)} bytes, more than {_LONGEST}")
-    try:
-        found = orjson.loads(data)
-    except orjson.JSONDecodeError:
-        raise BadValue(f"the payload is no JSON: {meant}") from None
-    if not isinstance(found, dict) or not found.keys() <= {"by", "raised"}:
-        raise BadValue(f"the payload is no acknowledgement: {meant}")
-    by, raised = found.get("by"), found.get("raised")
-    if not isinstance(by, str) or not by.strip():
-        raise BadValue(f"the name of the operator is missing: {meant}")
-    if len(by) > LONGEST_NAME or not by.isprintable():
-        raise BadValue(f"the name of the operator is longer than {LONGEST_NAME}, or not printable")
-    if raised is not None and not isinstance(raised, str):
-        raise BadValue("raised is no time: send it as the alarm's document has it")
-    return by.strip(), raised

@@ -46,6 +46,8 @@ class AlarmsSection(Section):
     """A line that is down is an alarm."""
     transfers: Watched = True
     """A transfer that does not work is an alarm."""
+    shelve_at_most: Duration = 86400.0
+    """The longest time that an operator may shelve an alarm."""
 
 
 def _place(settings: AlarmsSection, place: Place) -> AlarmsSection:

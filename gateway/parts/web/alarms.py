@@ -15,11 +15,19 @@ from gateway.plant.part import Core, Listed
 
 _STATE = Choice(
     "state",
-    "open, if left out: all that are not normal; all; or one state",
-    ("open", "all", "normal", "active", "acknowledged", "returned"),
+    "open, if left out: all that are not normal; suppressed: shelved or out of service; all; or "
+    "one state",
+    ("open", "suppressed", "all", "normal", "active", "acknowledged", "returned"),
 )
 _AFTER = Word("after", "Last alarm of the page before")
 _ALARM = Word("alarm", "device/tag, device, or line:name", required=True)
+_ORDERS = (
+    (
+        "/api/alarms/acknowledge",
+        "Acknowledges one alarm for an operator; a repeat gets the same answer",
+    ),
+    ("/api/alarms/order", "Shelves one alarm, takes it out of service, or puts it back: `do`"),
+)
 _STATUS = {
     Problem.BAD_VALUE: 400,
     Problem.NOT_ALLOWED: 403,
@@ -45,26 +53,29 @@ class AlarmApi:
                 reply=ref("Alarms"),
                 errors={400: "A wrong state or limit"},
             ),
-            Route(
-                "/api/alarms/acknowledge",
-                self._acknowledge,
-                "Acknowledges one alarm for an operator; a repeat gets the same answer",
-                method="post",
-                parameters=(_ALARM,),
-                body=ref("AcknowledgeRequest"),
-                reply=ref("AlarmDocument"),
-                done="It is acknowledged",
-                errors={
-                    403: "No token",
-                    408: "The body did not arrive",
-                    415: "No application/json",
-                },
-                failures={
-                    400: "bad-value: no name of an operator",
-                    404: "unknown-tag: no such alarm",
-                    409: "nothing-to-acknowledge: it is normal, or was raised again",
-                    503: "busy: this gateway is the standby, or stood still",
-                },
+            *(
+                Route(
+                    path,
+                    self._order,
+                    about,
+                    method="post",
+                    parameters=(_ALARM,),
+                    body=ref("AcknowledgeRequest"),
+                    reply=ref("AlarmDocument"),
+                    done="It is done, and on disk",
+                    errors={
+                        403: "No token",
+                        408: "The body did not arrive",
+                        415: "No application/json",
+                    },
+                    failures={
+                        400: "bad-value: no name of an operator, no reason or no end",
+                        404: "unknown-tag: no such alarm",
+                        409: "nothing-to-acknowledge: it is normal, or was raised again",
+                        503: "busy: this gateway is the standby, or stood still",
+                    },
+                )
+                for path, about in _ORDERS
             ),
         ]
 
@@ -79,7 +90,7 @@ class AlarmApi:
         except BadValue as error:
             return answer(400, str(error))
 
-    async def _acknowledge(self, request: web.Request) -> web.Response:
+    async def _order(self, request: web.Request) -> web.Response:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the operator's name as Content-Type: application/json")

@@ -22,6 +22,7 @@ export const onAlarms = (watcher) => watchers.push(watcher);
 
 on("state", async ({ alarms }) => {
   if (!alarms?.shown) return put("alarms-head", "The alarms do not work now");
+  showSuppressed(alarms.suppressed);
   if (!alarms.more) return takeAll(alarms.shown);
   if (!all.length) takeAll(alarms.shown);
   if (performance.now() - asked < EVERY) return;
@@ -75,7 +76,8 @@ function makeRow() {
   row.names = h("span");
   row.parts = h("details", {}, row.count, row.names);
   row.button = h("button", { type: "button", onclick: () => acknowledge(row.alarm) }, "Acknowledge");
-  row.append(h("div", {}, row.why, row.detail, row.where, row.parts), row.button);
+  row.shelve = h("button", { type: "button", onclick: () => shelve(row.alarm) }, "Shelve …");
+  row.append(h("div", {}, row.why, row.detail, row.where, row.parts), h("div", { className: "bar" }, row.button, row.shelve));
   return row;
 }
 
@@ -94,7 +96,59 @@ function showRow(row, one) {
   put(row.names, parts.join(", "));
   row.button.hidden = done || !gateway.you[1];
   row.button.setAttribute("aria-label", `acknowledge ${one.alarm}`);
+  row.shelve.hidden = !gateway.you[1];
+  row.shelve.setAttribute("aria-label", `shelve ${one.alarm}`);
   style(row, `alarm ${state}`);
+}
+
+function showSuppressed(found) {
+  byId("suppressed").hidden = !found.length;
+  keyed(byId("suppressed-list"), found, (one) => one.alarm, makeSuppressed, showRest);
+}
+
+function makeSuppressed() {
+  const row = h("li", { className: "alarm" });
+  row.why = h("b", { className: "why" });
+  row.where = h("span", { className: "where" });
+  row.button = h("button", { type: "button", onclick: () => order(row.alarm, { do: row.alarm.shelved ? "unshelve" : "in-service" }, "put back") }, "Put back");
+  row.append(h("div", {}, row.why, row.where), row.button);
+  return row;
+}
+
+function showRest(row, one) {
+  row.alarm = one;
+  const what = one.shelved ?? one.out_of_service;
+  const until = one.shelved ? `shelved until ${moment(Date.parse(what.until))}` : `out of service since ${moment(Date.parse(what.time))}`;
+  put(row.why, why(one));
+  put(row.where, [one.priority, one.alarm, `${until} by ${what.by}`, what.reason].join(" · "));
+  row.button.hidden = !gateway.you[1];
+  row.button.setAttribute("aria-label", `put ${one.alarm} back`);
+}
+
+let asking = null; // the alarm of the dialog
+
+async function shelve(one) {
+  if (!(await signedIn())) return;
+  asking = one;
+  put("shelve-title", `Shelve ${one.alarm}`);
+  byId("shelve").showModal();
+}
+
+byId("shelve-cancel").addEventListener("click", () => byId("shelve").close());
+byId("shelve-form").addEventListener("submit", () => {
+  const seconds = Number(byId("shelve-for").value);
+  const fields = { do: seconds ? "shelve" : "out-of-service", reason: byId("shelve-reason").value, ...(seconds && { seconds }) };
+  order(asking, fields, seconds ? "shelved" : "taken out of service");
+});
+
+async function order({ alarm }, fields, done) {
+  if (!(await signedIn())) return;
+  try {
+    const { ok, found } = await post("alarms/order", { alarm }, JSON.stringify({ by: operator(), ...fields }));
+    put("acknowledge-result", `${alarm}: ${ok ? done : found.reason ?? found.error}`);
+  } catch {
+    put("acknowledge-result", `${alarm}: the connection ended; it is not known whether it was ${done}`);
+  }
 }
 
 // The time of the alarm goes with it: an alarm that was raised again meanwhile is not acknowledged.
