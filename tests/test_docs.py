@@ -63,9 +63,10 @@ OF_PROGRAMS = (
     *("read-values.md", "slow-links.md", "write-values.md", "write-groups.md"),
     *("browse.md", "contract.md", "provenance.md"),
 )
-# The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
+# The tutorial's programs run in tests/e2e/test_story.py, the library's in
+# tests/protocols/test_library.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.
-RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md")
+RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md", "library.md")
 
 
 class Block(NamedTuple):

@@ -35,7 +35,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.capabilities import Identifies
 from gateway.protocols.driver import AnyDriver
-from gateway.protocols.registry import PROTOCOLS
+from gateway.protocols.registry import PROTOCOLS, fault_of
 from gateway.tags import Tag
 from gateway.tags.tag import READ, NotReal
 from gateway.transport.port import ListenAddress, ModemAddress, SerialPath
@@ -255,8 +255,9 @@ class Builder:
             self.mistakes.add(place, f"missing: a device needs its protocol: {protocols()}")
             return None
         if not isinstance(protocol, str) or protocol not in PROTOCOLS:
+            fault = fault_of(str(protocol))
             hint = meant(str(protocol), PROTOCOLS)
-            self.mistakes.add(place, f"{shown(protocol)} is no protocol: {hint}")
+            self.mistakes.add(place, fault or f"{shown(protocol)} is no protocol: {hint}")
             return None
         known = driver_settings(protocol)
         for key in own.keys() - known:

@@ -1,169 +1,53 @@
-"""A protocol that the package does not know: registered from outside, it works everywhere.
-
-The toy device holds numbers N0 to N99. `R5 N7` reads one at station 5, `W5 N7 42` writes one;
-the reply is `=5 N7 42`, or `!5 N7` where the number does not exist.
-"""
+"""A protocol of another package (examples/driver): its entry point is enough for every command."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import tomllib
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import pytest
+from toy_plc import Toy, ToyStation, toy_station
 
 from gateway.cli.line import direct
 from gateway.cli.line.scan import Plan, planned, scan
 from gateway.cli.main import main
 from gateway.config import Config, ConfigErrors, load, schema
-from gateway.errors import ConfigError, Refusal, Refused
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols import registry as protocols
-from gateway.protocols.capabilities import ScanHints
-from gateway.protocols.driver import Address, Area, Cost, Driver, Span, Talk, Timing, Traits, Unit
+from gateway.protocols.driver import Driver, Span
+from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations import registry as stations
-from gateway.stations.station import Memory
 from gateway.tags import Quality, WriteResult
 from gateway.transport import Port, Receiver, SerialSettings
 from gateway.values import Kind
-from tests.e2e.processes import write_config
+from tests.e2e.processes import ROOT, write_config
 from tests.sim.virtual import on_virtual_time
 
-NUMBERS = Area("N", Unit.WORD, 0, 99)
 
-
-class ToyCodec:
-    """One frame is one line of text."""
-
-    def __init__(self) -> None:
-        self._buffer = b""
-
-    def encode(self, frame: str) -> bytes:
-        return frame.encode() + b"\n"
-
-    def feed(self, data: bytes) -> list[str]:
-        *lines, self._buffer = (self._buffer + data).split(b"\n")
-        return [line.decode("ascii", "replace") for line in lines]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Toy:
-    """The driver; its fields are its settings in the file."""
-
-    protocol: Literal["toy"] = "toy"
-    station: int = 1
-    upper: bool = True  # the letters of requests
-
-    scan_hints: ClassVar = ScanHints(
-        formats=("8E2",), stations=range(3, 10), variants=({"upper": False}, {"upper": True})
-    )
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.station <= 9:
-            raise ConfigError(f"station {self.station} is not 1..9")
-
-    @property
-    def traits(self) -> Traits:
-        return Traits(baudrate=4800, format="8E2", binary=True, word_type=Kind.UINT16)
-
-    @property
-    def timing(self) -> Timing:
-        return Timing(reply_timeout=0.2)
-
-    @property
-    def areas(self) -> Mapping[str, Area]:
-        return {"N": NUMBERS}
-
-    def address(self, text: str) -> Address:
-        if text[:1] != "N" or not text[1:].isdecimal() or int(text[1:]) > NUMBERS.last:
-            raise ConfigError(f"{text} is no address: write N0 to N{NUMBERS.last}")
-        return Address("N", int(text[1:]))
-
-    def spell(self, address: Address) -> str:
-        return f"N{address.number}"
-
-    def cost(self, span: Span) -> Cost | None:
-        return Cost(7, 13) if span.size == 1 else None
-
-    def write_cost(self, span: Span) -> Cost | None:
-        return Cost(13, 13) if span.size == 1 else None
-
-    def codec(self) -> ToyCodec:
-        return ToyCodec()
-
-    async def read(self, talk: Talk[str], span: Span) -> Sequence[int]:
-        return [await self._ask(talk, "R", f"N{span.start}")]
-
-    async def write(self, talk: Talk[str], span: Span, units: Sequence[int]) -> bool:
-        await self._ask(talk, "W", f"N{span.start} {units[0]}")
-        return True
-
-    async def resync(
-        self,
-        talk: Talk[str],
-        outstanding: Span | None,
-        probe_token: int,
-        spans: Sequence[Span] = (),
-    ) -> int:
-        number = probe_token % 100
-        if outstanding is not None and number == outstanding.start:
-            number = (number + 1) % 100
-        await self._ask(talk, "R", f"N{number}")
-        return 99
-
-    async def _ask(self, talk: Talk[str], letter: str, body: str) -> int:
-        name = body.split()[0]
-        expected = f"{self.station} {name}"
-
-        def accept(frame: str) -> int | None:
-            if frame == f"!{expected}":
-                raise Refused(f"{name} does not exist", code="!", refusal=Refusal.ADDRESS)
-            begin = f"={expected} "
-            return int(frame.removeprefix(begin)) if frame.startswith(begin) else None
-
-        command = letter if self.upper else letter.lower()
-        return await talk.ask(f"{command}{self.station} {body}", 13, accept)
-
-
-class ToyStation:
-    """The simulated device."""
-
-    def __init__(self, station: int, upper: bool) -> None:
-        self.memory = Memory([("N", NUMBERS.first, NUMBERS.last)])
-        self._station = station
-        self._letters = "RW" if upper else "rw"
-        self._codec = ToyCodec()
-
-    def hear(self, data: bytes, now: float) -> list[bytes]:
-        replies = [self._reply(frame, now) for frame in self._codec.feed(data)]
-        return [self._codec.encode(reply) for reply in replies if reply]
-
-    def _reply(self, frame: str, now: float) -> str:
-        command, name, *value = frame.split()
-        if command[0] not in self._letters or command[1:] != str(self._station):
-            return ""
-        number = int(name[1:])
-        if not self.memory.holds("N", number):
-            return f"!{self._station} {name}"
-        if value:
-            self.memory.write("N", number, [int(value[0])])
-        [held] = self.memory.read("N", number, 1, now)
-        return f"={self._station} {name} {held}"
-
-
-def toy_station(driver: Toy) -> ToyStation:
-    return ToyStation(driver.station, driver.upper)
+def installed(folder: Path, package: str, entry: str) -> None:
+    """Writes what pip leaves of a package: its name and its entry point."""
+    left = folder / f"{package}-1.0.dist-info"
+    left.mkdir()
+    (left / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (left / "entry_points.txt").write_text(f"[gateway.protocols]\n{entry}\n")
 
 
 @pytest.fixture(autouse=True)
-def registered() -> Iterator[None]:
-    protocols.register(Toy)
-    stations.register("toy", toy_station)
-    yield
-    protocols.unregister("toy")
-    stations.unregister("toy")
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of packages on the path; the toy is one of them."""
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+    project = tomllib.loads((ROOT / "examples/driver/pyproject.toml").read_text("utf-8"))
+    [(name, place)] = project["project"]["entry-points"]["gateway.protocols"].items()
+    installed(folder, project["project"]["name"], f"{name} = {place}")
+    yield folder
+    for protocol in ("toy", "broken"):
+        protocols.unregister(protocol)
 
 
 def plant(folder: Path, port: str = "simulator", **settings: Any) -> Path:
@@ -221,13 +105,18 @@ def test_the_schema_has_its_settings() -> None:
     assert (properties["station"]["minimum"], properties["station"]["maximum"]) == (1, 9)
 
 
+def check(file: Path, monkeypatch: pytest.MonkeyPatch) -> object:
+    """`plc-gateway check` in this process. Returns its exit code."""
+    monkeypatch.setattr(sys, "argv", ["plc-gateway", "check", str(file)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code or 0
+
+
 def test_check_forecasts_its_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["plc-gateway", "check", str(plant(tmp_path, "/dev/ttyS3"))])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code in (0, None)
+    assert check(plant(tmp_path, "/dev/ttyS3"), monkeypatch) == 0
     assert "4800" in capsys.readouterr().out
 
 
@@ -275,7 +164,78 @@ async def test_scan_finds_it_with_its_settings() -> None:
 
 
 def test_a_name_is_registered_once() -> None:
+    assert "toy" in protocols.PROTOCOLS
     with pytest.raises(ValueError, match="a protocol toy already"):
         protocols.register(Toy)
     with pytest.raises(ValueError, match="a station for toy already"):
         stations.register("toy", toy_station)
+
+
+SOURCES = {
+    "broken_at_import": "raise RuntimeError('no licence')",
+    "broken_class": (
+        "from dataclasses import dataclass\n@dataclass\nclass Half:\n"
+        "    protocol: str = 'broken'\n    station: int = 1\n"
+        "from toy_plc import Toy as Other\nnothing = None\n"
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [
+        ("broken_nowhere:Half", "ModuleNotFoundError: No module named 'broken_nowhere'"),
+        ("broken_at_import:Half", "RuntimeError: no licence"),
+        ("broken_class:Missing", "AttributeError: module 'broken_class' has no attribute"),
+        ("broken_class:nothing", "TypeError: "),
+        (
+            "broken_class:Half",
+            "its driver has no address, areas, codec, cost, read, resync, spell, timing, traits",
+        ),
+        ("broken_class:Other", "its driver calls itself toy"),
+    ],
+)
+def test_a_broken_package_is_named_where_a_file_uses_it_and_nowhere_else(
+    packages: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    place: str,
+    why: str,
+) -> None:
+    for name, source in SOURCES.items():
+        (packages / f"{name}.py").write_text(source)
+    installed(packages, "half-plc", f"broken = {place}")
+    assert check(plant(tmp_path), monkeypatch) == 0
+    assert "broken" not in capsys.readouterr().err
+    file = plant(tmp_path, protocol="broken")
+    assert check(file, monkeypatch) == 2
+    said = capsys.readouterr().err
+    assert "hall.devices.toy.protocol: " in said
+    assert f"the protocol broken of half-plc 1.0 cannot be used: {why}" in said
+    assert "broken" not in protocols.PROTOCOLS
+    for name in SOURCES:
+        sys.modules.pop(name, None)
+
+
+def test_two_packages_with_one_protocol_are_both_named(packages: Path, tmp_path: Path) -> None:
+    installed(packages, "one-plc", "broken = toy_plc:Toy")
+    installed(packages, "other-plc", "broken = toy_plc:Toy")
+    with pytest.raises(ConfigErrors) as error:
+        load(plant(tmp_path, protocol="broken"))
+    for name in ("one-plc 1.0", "other-plc 1.0", "cannot be used: remove one of them"):
+        assert name in str(error.value)
+
+
+def test_no_package_takes_the_place_of_a_protocol_of_the_gateway(packages: Path) -> None:
+    installed(packages, "evil-plc", "vigor = toy_plc:Toy")
+    assert protocols.PROTOCOLS["vigor"].settings is Vigor
+    assert list(protocols.PROTOCOLS).count("vigor") == 1
+
+
+def test_the_list_of_protocols_has_those_of_other_packages_that_work(packages: Path) -> None:
+    installed(packages, "half-plc", "broken = broken_nowhere:Half")
+    names = list(protocols.PROTOCOLS)
+    assert "toy" in names
+    assert "broken" not in names
+    assert len(protocols.PROTOCOLS) == len(names)
