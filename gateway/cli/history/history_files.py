@@ -98,8 +98,7 @@ def _parquet_writer(columns: Sequence[Column]) -> Callable[[Path, Rows], int]:
         from pyarrow import parquet
     except ImportError:
         raise ConfigError(
-            "a .parquet file needs one more package: pip install 'zenoh-plc-gateway[parquet]', "
-            "or export CSV"
+            "a .parquet file needs one more package: pip install pyarrow, or export CSV"
         ) from None
     types = {
         "time": pa.timestamp("us", tz="UTC"),

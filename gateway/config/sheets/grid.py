@@ -159,8 +159,7 @@ def _xlsx(data: bytes) -> list[Row]:
         from openpyxl import load_workbook
     except ImportError:
         raise ConfigError(
-            "an .xlsx file needs one more package: pip install 'zenoh-plc-gateway[xlsx]', "
-            "or save the sheet as CSV"
+            "an .xlsx file needs one more package: pip install openpyxl, or save the sheet as CSV"
         ) from None
     try:
         book = load_workbook(io.BytesIO(data), read_only=True, data_only=True)
