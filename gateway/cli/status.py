@@ -14,7 +14,14 @@ from rich.text import Text
 from gateway.cli.client import reached
 from gateway.cli.repeated import repeated
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
-from gateway.contract.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.faults import (
+    ALARM_STATES,
+    Documents,
+    below,
+    faults,
+    transfers,
+    warnings,
+)
 from gateway.contract.line_faults import span
 from gateway.tags.tag import NotReal
 
@@ -195,7 +202,8 @@ def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Ta
         again = f", {reload['reloads']} reloads" if reload["reloads"] else ""
         table.add_row("file", Text(printable(f"of {reload['loaded'][:19]}Z{again}")))
     if alarms := documents.get("alarms"):
-        text = ", ".join(f"{n} {state}" for state, n in alarms.items() if n and state != "normal")
+        states = [state for state in ALARM_STATES[1:] if alarms.get(state)]
+        text = ", ".join(f"{alarms[state]} {state}" for state in states)
         table.add_row("alarms", Text(text.replace("_", " ") or "none"))
     if outcomes is not None:
         known = Counter(str(outcome.get("outcome")) for outcome in outcomes)

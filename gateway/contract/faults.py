@@ -8,6 +8,7 @@ from gateway.contract.line_faults import device_warnings, line_fault, stands_by
 
 JUMP_SHOWN = 3600.0  # seconds
 DAYS_LEFT = 30  # of a certificate
+ALARM_STATES = ("normal", "active", "acknowledged", "returned", "shelved", "out_of_service")
 ROWS_SHOWN = 10  # numbers of transfers in one sentence
 Document = Mapping[str, Any]
 Documents = Mapping[str, Document]  # by path: `status`, `lines/hall-1`, `devices/mixer`
@@ -91,6 +92,12 @@ def warnings(documents: Documents) -> Iterator[str]:
         yield (
             f"the clock of this machine jumped by {clock['last']:+.1f} s {ago / 60:.0f} min ago: "
             "times before and after it do not belong together"
+        )
+    alarms = documents.get("alarms", {})
+    if since := alarms.get("flood_since"):
+        yield (
+            f"alarm flood since {since[:19]}Z: {alarms['raised_in_10_min']} alarms in 10 min, more "
+            "than an operator reads: `plc-gateway alarms`"
         )
     if lost := documents.get("history", {}).get("lost"):
         yield f"history: {lost} samples were lost since the start"

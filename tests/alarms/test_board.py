@@ -11,9 +11,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from gateway.config import load
-from gateway.contract.faults import faults
+from gateway.contract.faults import faults, warnings
 from gateway.errors import Busy
-from gateway.parts.alarms.board import Alarms, Entry
+from gateway.parts.alarms.board import Alarms
+from gateway.parts.alarms.entry import Entry
 from gateway.parts.alarms.file import AlarmFile, parse
 from gateway.parts.alarms.machine import Event, State
 from gateway.parts.alarms.part import AlarmPart
@@ -65,7 +66,7 @@ async def test_a_delay_ends_although_the_value_is_sent_once() -> None:
     assert board.state() is State.NORMAL
     await asyncio.sleep(0.2)
     assert board.state() is State.ACTIVE
-    assert board.alarms.counts() == {
+    assert board.alarms.tally.counts() == {
         "normal": 0,
         "active": 1,
         "acknowledged": 0,
@@ -206,7 +207,7 @@ async def test_acknowledged_alarms_survive_a_restart(tmp_path: Path) -> None:
         assert status == before.alarms.entries["mixer/speed"].status
         assert status.acknowledged is not None
         assert status.acknowledged.by == "Ana"
-        assert after.alarms.counts()["acknowledged"] == 1
+        assert after.alarms.tally.counts()["acknowledged"] == 1
 
 
 @pytest.mark.parametrize(
@@ -310,3 +311,30 @@ async def test_a_computed_tag_and_a_debounced_bit_have_alarms(tmp_path: Path) ->
     ):
         gateway.samples([good(reads, value, at)])
         assert alarms.entries["mixer/door"].status.state is state
+
+
+@on_virtual_time
+async def test_more_than_ten_alarms_in_ten_minutes_are_a_flood() -> None:
+    rule = AlarmRule({Level.HIGH: 80})
+    tags = [tag("mixer", f"t{n}", alarm=rule) for n in range(12)]
+    board = Board(*tags)
+
+    def floods() -> list[str]:
+        board.alarms.look()
+        document: Any = board.alarms.tally.document()
+        return list(warnings({"status": {"refused_devices": {}}, "alarms": document}))
+
+    with capture_logs() as logs:
+        for one in tags[:10]:
+            await asyncio.sleep(10)
+            board.alarms.judge([good(one, 85, 1)])
+        assert floods() == []
+        board.alarms.judge([good(one, 85, 1) for one in tags[10:]])
+        [flood] = floods()
+        assert "12 alarms in 10 min" in flood
+        await asyncio.sleep(570)  # six are left
+        assert len(floods()) == 1
+        await asyncio.sleep(20)  # four
+        assert floods() == []
+    events = [one["event"] for one in logs if "flood" in one["event"]]
+    assert events == ["alarm flood began", "alarm flood ended"]

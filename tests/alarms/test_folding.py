@@ -11,7 +11,8 @@ from gateway.config import load
 from gateway.contract.status import BACK, is_silent
 from gateway.engine.device.health import State as Health
 from gateway.errors import ConfigError, LineDown, NoReply, NothingToAcknowledge
-from gateway.parts.alarms.board import OWN_AFTER, Entry
+from gateway.parts.alarms.board import OWN_AFTER
+from gateway.parts.alarms.entry import Entry
 from gateway.parts.alarms.file import parse, snapshot
 from gateway.parts.alarms.machine import Alarm, Event, State
 from gateway.parts.alarms.part import AlarmPart

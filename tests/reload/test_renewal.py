@@ -233,15 +233,15 @@ async def test_alarms_follow_their_tags_devices_and_lines() -> None:
     async with running(data) as plant:
         alarms = find(plant.parts, AlarmPart).alarms
         await plant.until_good("mixer/level")
-        assert list(alarms.open) == ["mixer/level"]
+        assert list(alarms.tally.open) == ["mixer/level"]
         await plant.reload(lambda data: device(data, "mixer").update(defaults={"every": "200ms"}))
-        assert list(alarms.open) == ["mixer/level"]
+        assert list(alarms.tally.open) == ["mixer/level"]
         await asyncio.sleep(2)  # the line goes on with the alarm of the tag
         assert plant.sample("mixer/level").quality is Quality.GOOD
         await plant.reload(lambda data: device(data, "mixer").update(station=7))
-        assert list(alarms.open) == ["mixer/level"]  # bad quality never clears an alarm
+        assert list(alarms.tally.open) == ["mixer/level"]  # bad quality never clears an alarm
         await plant.reload(lambda data: alarmed(data, 30000.0))
-        assert list(alarms.open) == []
+        assert list(alarms.tally.open) == []
         await plant.reload(lambda data: data["lines"].pop("hall"))
         assert set(alarms.entries) == {"pump", "line:yard"}
 

@@ -159,7 +159,7 @@ class Chain:
 
 
 def active(alarms: Alarms) -> list[str]:
-    found = alarms.open.items()
+    found = alarms.tally.open.items()
     return [key for key, entry in found if entry.status.state is State.ACTIVE]
 
 

@@ -168,6 +168,8 @@ class AlarmCounts(TypedDict):
     returned: int
     shelved: NotRequired[int]
     out_of_service: NotRequired[int]
+    raised_in_10_min: NotRequired[int]
+    flood_since: NotRequired[Time | None]
 
 
 class PartDocument(TypedDict):

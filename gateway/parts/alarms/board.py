@@ -6,85 +6,24 @@ A scan whose tags have no alarm costs one look at the scan.
 import asyncio
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import structlog
 
 from gateway.errors import NothingToAcknowledge
-from gateway.parts.alarms.machine import (
-    IN_ALARM,
-    Acknowledgement,
-    Alarm,
-    Event,
-    State,
-    Status,
-    Suppression,
-)
-from gateway.plant.doors import Condition, Reading
+from gateway.parts.alarms.entry import Entry, log_change
+from gateway.parts.alarms.machine import Acknowledgement, Alarm, Event, Status, Suppression
+from gateway.parts.alarms.tally import Tally
+from gateway.plant.doors import Condition
 from gateway.tags import AlarmRule, Level, Quality, Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.values import Value
 
-log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
-
-# What operators do.
-AUDITED = (Event.ACKNOWLEDGED, Event.SHELVED, Event.UNSHELVED, Event.REMOVED, Event.PUT_BACK)
+log = structlog.get_logger("gateway")
 # Seconds after the end of an alarm until its parts are alarms of their own again: the devices of a
 # line that is back reply one after the other.
 OWN_AFTER = 10.0
-_UNKNOWN = Reading(None)
 _GOOD, _UNCERTAIN = Quality.GOOD, Quality.UNCERTAIN  # looking up a member takes 0.2 µs
-
-
-@dataclass(slots=True, eq=False)
-class Entry:
-    """One alarm. `key`: `device/tag`, `device`, or `line:name`. `tag`: None for the last two."""
-
-    key: str
-    alarm: Alarm
-    tag: Tag | None = None
-    look: Callable[[], Reading] | None = None  # only for lines and devices
-    reading: Reading = _UNKNOWN  # what it returned last
-    parent: str = ""  # the alarm of which it may be a part
-    own_from: float = -math.inf  # it is no part from then on, by the loop's clock
-    released_at: float = math.inf  # the end of its shelving, by the loop's clock
-    by: Acknowledgement | None = None  # who put it back; None: the time did
-    counted: State = State.NORMAL
-    timer: asyncio.TimerHandle | None = None  # of the delay
-
-    @property
-    def status(self) -> Status:
-        return self.alarm.status
-
-    @property
-    def in_alarm(self) -> bool:
-        return self.status.state in IN_ALARM
-
-    @property
-    def covers(self) -> bool:
-        """True while the devices of a line are part of its alarm, also of a shelved one."""
-        return self.in_alarm or (self.alarm.is_suppressed and self.alarm.reached is not None)
-
-    @property
-    def part_of(self) -> str:
-        """The key of the alarm that it is a part of; empty: it is one of its own."""
-        return self.parent if self.alarm.is_part and self.reading.alarm is not False else ""
-
-    def operator(self, event: Event) -> Acknowledgement | Suppression | None:
-        """Returns who did what `event` says; None: the end of a shelving by time, and others."""
-        match event:
-            case Event.ACKNOWLEDGED:
-                return self.status.acknowledged
-            case Event.SHELVED | Event.REMOVED:
-                return self.status.suppressed
-        return self.by if event in AUDITED else None
-
-    @property
-    def text(self) -> str:
-        rule, level = self.alarm.rule, self.status.level
-        return rule.text if level is None else rule.texts.get(level, rule.text)
 
 
 # Receives each change of an alarm. Event None: only the quality of the value has changed.
@@ -97,13 +36,11 @@ class Alarms:
     def __init__(self, tags: Iterable[Tag], wall: Callable[[], int] = time.time_ns) -> None:
         """`wall`: ns since 1970."""
         self.entries: dict[str, Entry] = {}
-        self.open: dict[str, Entry] = {}  # those that are not normal
-        self._kept: dict[str, Entry] = {}  # those that a restart must not lose
+        self.tally = Tally()
         self.changed = asyncio.Event()  # something is to be saved
         self._by_tag: dict[Tag, Entry] = {}
         self._watched: list[Entry] = []
         self._parts: dict[str, list[Entry]] = {}  # by the key of their parent
-        self._counts: Counter[State] = Counter()
         self._sinks: list[Sink] = []
         self._wall = wall
         for tag in tags:
@@ -154,9 +91,7 @@ class Alarms:
             entry.timer.cancel()
         if self.entries.get(entry.key) is entry:
             del self.entries[entry.key]
-            self.open.pop(entry.key, None)
-            self._kept.pop(entry.key, None)
-            self._counts[entry.counted] -= 1
+            self.tally.drop(entry)
             self.changed.set()
 
     def _renew(self, key: str, rule: AlarmRule) -> Entry:
@@ -167,25 +102,16 @@ class Alarms:
             if (what := old.status.suppressed) is not None:
                 new.alarm.status, new.released_at = Status(suppressed=what), old.released_at
         self._add(new)
-        self._count(new)
+        self.tally.count(new)
         return new
 
     def _add(self, entry: Entry) -> Entry:
         self.entries[entry.key] = entry
-        self._counts[State.NORMAL] += 1
+        self.tally.add(entry)
         return entry
 
     def subscribe(self, sink: Sink) -> None:
         self._sinks.append(sink)
-
-    def counts(self) -> Mapping[str, int]:
-        """The status document: alarms by state, and how many of the normal ones are suppressed."""
-        ends = [one.status.suppressed for one in self.kept()]
-        return {
-            **{state.value: self._counts[state] for state in State},
-            "shelved": sum(what is not None and what.until is not None for what in ends),
-            "out_of_service": sum(what is not None and what.until is None for what in ends),
-        }
 
     # -- from the lines --
 
@@ -240,27 +166,15 @@ class Alarms:
 
     def _report(self, entry: Entry, event: Event | None) -> None:
         if event is not None:
-            self._count(entry)
+            self.tally.count(entry)
             self.changed.set()
-            _log(entry, event)
+            log_change(entry, event)
         for sink in self._sinks:
             sink(entry, event)
         if event is Event.RAISED:
+            self.tally.note_raised(asyncio.get_running_loop().time())
             for part in self.parts(entry):
                 self._fold(part)
-
-    def _count(self, entry: Entry) -> None:
-        self._counts[entry.counted] -= 1
-        entry.counted = entry.status.state
-        self._counts[entry.counted] += 1
-        for found, belongs in (
-            (self.open, entry.counted is not State.NORMAL),
-            (self._kept, entry.counted is not State.NORMAL or entry.alarm.is_kept),
-        ):
-            if belongs:
-                found[entry.key] = entry
-            else:
-                found.pop(entry.key, None)
 
     # -- from operators --
 
@@ -304,7 +218,7 @@ class Alarms:
         for key, status in known.items():
             if (entry := self.entries.get(key)) is not None:
                 entry.alarm.restore(status)
-                self._count(entry)
+                self.tally.count(entry)
                 if entry.alarm.is_part:
                     entry.own_from = asyncio.get_running_loop().time() + OWN_AFTER
                 if (what := status.suppressed) is not None and what.until is not None:
@@ -315,11 +229,7 @@ class Alarms:
 
     def statuses(self) -> Mapping[str, Status]:
         """Returns the alarms that a restart must not lose."""
-        return {key: entry.status for key, entry in self._kept.items()}
-
-    def kept(self) -> list[Entry]:
-        """Returns those alarms. Any thread may call it."""
-        return list(self._kept.values())
+        return {entry.key: entry.status for entry in self.tally.kept()}
 
     def level(self, key: str) -> Level | None:
         """Returns the level of an alarm that is reached now."""
@@ -348,7 +258,8 @@ class Alarms:
     def look(self) -> None:
         """Looks at the conditions."""
         now = asyncio.get_running_loop().time()
-        for entry in [one for one in self.kept() if one.released_at <= now]:
+        self.tally.look(now, self._wall())
+        for entry in [one for one in self.tally.kept() if one.released_at <= now]:
             self.release(entry)
         for entry in self._watched:
             self._look(entry)
@@ -360,7 +271,7 @@ class Alarms:
             self._apply(entry, entry.reading.alarm, _GOOD, self._wall())
             self._fold(entry)
             if before != (entry.part_of, entry.status.folded):
-                self._count(entry)
+                self.tally.count(entry)
                 self.changed.set()
                 self._report(entry, None)
 
@@ -370,22 +281,3 @@ class Alarms:
             if entry.timer is not None:
                 entry.timer.cancel()
                 entry.timer = None
-
-
-def _log(entry: Entry, event: Event) -> None:
-    status = entry.status
-    fields: dict[str, object] = {"alarm": entry.key, "state": status.state.value}
-    if event in AUDITED:
-        by = entry.operator(event)
-        reason = {"reason": status.suppressed.reason} if status.suppressed is not None else {}
-        log.info(f"alarm {event.value}", **fields, by=by and by.by, via=by and by.via, **reason)
-        return
-    fields["text"] = entry.text
-    if entry.tag is not None:
-        fields["value"] = status.value
-    if entry.part_of:
-        fields["part_of"] = entry.part_of
-    if event is Event.RAISED:
-        log.warning("alarm raised", **fields, limit=str(status.level))
-    else:
-        log.info(f"alarm {event.value}", **fields)

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Sequence
 
 from gateway.contract import payload
-from gateway.parts.alarms.board import AUDITED, Alarms, Entry
+from gateway.parts.alarms.board import Alarms
+from gateway.parts.alarms.entry import AUDITED, Entry
 from gateway.parts.alarms.machine import Event, State
 from gateway.tags import Level, Priority, Quality, Sample, Tag
 from gateway.tags.timestamps import rfc3339
@@ -92,10 +93,10 @@ def open_alarms(alarms: Alarms) -> list[Entry]:
         status, urgent = entry.status, _URGENT.index(entry.alarm.rule.priority)
         return _ORDER[status.state], urgent, -status.since
 
-    return sorted(alarms.open.values(), key=place)
+    return sorted(alarms.tally.open.values(), key=place)
 
 
 def suppressed_alarms(alarms: Alarms) -> list[Entry]:
     """Returns the alarms that are shelved or out of service: the latest first."""
-    found = [one for one in alarms.kept() if one.status.suppressed is not None]
+    found = [one for one in alarms.tally.kept() if one.status.suppressed is not None]
     return sorted(found, key=lambda entry: -entry.status.since)

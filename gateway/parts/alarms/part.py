@@ -13,13 +13,14 @@ from gateway.config import Config
 from gateway.contract import payload
 from gateway.contract.interfaces import Keyed
 from gateway.errors import BadValue, Busy, NoHistory, Unknown
-from gateway.parts.alarms.board import AUDITED, Alarms, Entry
+from gateway.parts.alarms.board import Alarms
 from gateway.parts.alarms.documents import (
     alarm_fields,
     event_fields,
     open_alarms,
     suppressed_alarms,
 )
+from gateway.parts.alarms.entry import AUDITED, Entry
 from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.alarms.machine import Acknowledgement, Event, State, Suppression
 from gateway.parts.alarms.orders import Do, Order, parse_order
@@ -89,7 +90,7 @@ class AlarmPart:
     # -- documents --
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
-        found: dict[str, Mapping[str, object]] = {"alarms": self.alarms.counts()}
+        found: dict[str, Mapping[str, object]] = {"alarms": self.alarms.tally.document()}
         if self._settings.path is not None:
             found["files/alarms"] = {"trouble": self._file.trouble}
         return found
@@ -187,7 +188,7 @@ class AlarmPart:
             found = found[keys.index(after) + 1 :] if after in keys else []
         return {
             "alarms": [self._fields(one) for one in islice(found, most)],
-            "counts": self.alarms.counts(),
+            "counts": self.alarms.tally.counts(),
             "next": found[most - 1].key if len(found) > most else None,
         }
 

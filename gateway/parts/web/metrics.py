@@ -18,7 +18,14 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
-from gateway.contract.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.faults import (
+    ALARM_STATES,
+    Documents,
+    below,
+    faults,
+    transfers,
+    warnings,
+)
 from gateway.contract.interfaces import Plant
 from gateway.contract.line_faults import stands_by
 from gateway.engine.device.records import COMPLETE
@@ -111,8 +118,9 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
             days.add_metric([certificate["file"]], certificate["days"])
     yield days
     alarms = _family("alarms", "Alarms by state", "state")
-    for state, count in documents.get("alarms", {}).items():
-        alarms.add_metric([state], count)
+    counts = documents.get("alarms", {})
+    for state in filter(counts.__contains__, ALARM_STATES):
+        alarms.add_metric([state], counts[state])
     yield alarms
     if (clock := documents.get("clock")) is not None:
         yield _one("clock_jumps_total", "Jumps of the clock of the machine", {}, clock["jumps"])
