@@ -43,6 +43,10 @@ def alarms(
         bool, typer.Option("--watch", help="Show them again every second. Ctrl-C ends it.")
     ] = False,
     every: Annotated[bool, typer.Option("--all", help="Also alarms that are normal.")] = False,
+    past: Annotated[
+        str | None,
+        typer.Option("--past", metavar="TIME", help="What changed in this time, such as 1d."),
+    ] = None,
     ack: Annotated[
         str | None,
         _alarm(
@@ -80,6 +84,9 @@ def alarms(
         raise ConfigError("give one of --ack, --shelve and others, with --by NAME, the operator")
     if not given:
         with reached(config, err.print) as client:
+            if past is not None:
+                _print_past(client, parsers.duration(past), as_json=as_json)
+                return
             _print(client, watch=watch, every=every, as_json=as_json)
         return
     [(do, alarm)] = given
@@ -109,6 +116,14 @@ def _print(client: Client, *, watch: bool, every: bool, as_json: bool) -> None:
         print(json.dumps(found))
     else:
         out.print(view(found))
+
+
+def _print_past(client: Client, seconds: float, *, as_json: bool) -> None:
+    found = client.past_alarms(f"now(-{seconds:g}s)")
+    if as_json:
+        print(json.dumps(found))
+    else:
+        out.print(past_view(found) if found else "no changes of alarms")
 
 
 def _known(path: Path) -> dict[str, None]:
@@ -202,6 +217,28 @@ def view(found: Sequence[dict[str, Any]]) -> RenderableType:
             Text(_moment(one["since"] or "")),
             Text(printable("" if by is None else by["by"])),
             Text(printable(rest or ": ".join(text for text in texts if text))),
+        )
+    return table
+
+
+def past_view(found: Sequence[dict[str, Any]]) -> RenderableType:
+    """Returns changes of alarms as a table."""
+    table = Table(box=None, pad_edge=False)
+    for column in ("time", "alarm", "priority", "what", "state", "value", "by", "text"):
+        table.add_column(column)
+    for one in found:
+        what = str(one.get("change") or one["event"])
+        by = one["acknowledged"] if one["event"] == "acknowledged" else one
+        reason = _rest(one) or (f"part of {one['part_of']}" if "part_of" in one else one["text"])
+        table.add_row(
+            Text(_moment(one["since"] or "")),
+            Text(printable(one["alarm"])),
+            Text(one.get("priority", "")),
+            Text(f"{what} {one['level']}" if what in ("raised", "eased") else what),
+            Text(one["state"], style=_STYLES.get(one["state"], "")),
+            Text(printable(f"{one['value_at_change']} {one['unit']}".strip())),
+            Text(printable(by.get("by") or "")),
+            Text(printable(reason)),
         )
     return table
 

@@ -158,6 +158,10 @@ class Listed(Protocol):
     def page(self, state: str, after: str | None, most: int) -> Mapping[str, Any]:
         """Returns a page, after the alarm `after`. Any thread may call it. Raises `BadValue`."""
 
+    def past(self, time_range: str, most: int) -> Sequence[Mapping[str, Any]]:
+        """Returns the newest changes of a time, the newest first. Any thread may call it. Raises as
+        `History.alarms`, and `NoHistory`."""
+
 
 @runtime_checkable
 class Routed(Protocol):

@@ -187,14 +187,17 @@ async def test_each_order_is_a_row_of_the_journal_and_of_the_audit(tmp_path: Pat
 
     others: Any = desk.part._core.others
     others.each = lambda _capability: [Audit()]
+    desk.take(85)
     for order in (SHELVE, {"by": "Bo", "do": "unshelve"}, REMOVE, {"by": "Cy", "do": "in-service"}):
         await desk.order(order)
-    assert [(one["event"], one["change"], one["by"], one["via"]) for one in told] == [
-        ("ended", "shelved", "Ana", "hmi"),
-        ("ended", "unshelved", "Bo", "hmi"),
-        ("ended", "out of service", "Ana", "hmi"),
-        ("ended", "in service", "Cy", "hmi"),
+    assert {(one["event"], one["state"], one["via"]) for one in told} == {
+        ("ended", "normal", "hmi")
+    }
+    assert [(one["change"], one["by"]) for one in told] == [
+        *(("shelved", "Ana"), ("unshelved", "Bo")),
+        *(("out of service", "Ana"), ("in service", "Cy")),
     ]
+    assert desk.speed["state"] == "active"
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,15 @@
 """The command `alarms` at a running gateway: shelving, and what its lists show."""
 
+import io
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
+from gateway.cli.alarms import past_view
 from tests.cli.conftest import Command
 
 
@@ -27,6 +31,40 @@ def test_an_alarm_is_shelved_listed_and_put_back(running: Path, command: Command
     assert told("--in-service", "mixer") == "mixer: normal"
     assert told("--ack", "*") == "0 of 0 alarms acknowledged"
     assert command("alarms", running).out.strip() == "no alarms"
+
+
+def test_past_alarms_say_what_changed_and_who_did_it() -> None:
+    plain: dict[str, Any] = {
+        "alarm": "mixer/speed",
+        "priority": "high",
+        "state": "active",
+        "level": "high",
+    }
+    plain |= {"value_at_change": 85, "unit": "%", "text": "too fast", "acknowledged": None}
+    what = {"by": "Bo", "time": "2026-11-20T12:00:03Z", "reason": "rebuilt", "via": None}
+    normal = {"state": "normal", "level": None}
+    rows: list[dict[str, Any]] = [
+        {"event": "raised"},
+        {"event": "acknowledged", "acknowledged": {"by": "Ana"}},
+        {"event": "ended", "change": "out of service", "out_of_service": what, "by": "Bo"} | normal,
+        {"event": "ended", "change": "folded", "part_of": "line:hall"} | normal,
+    ]
+    at = {"since": "2026-11-20T12:00:00.5Z"}
+    console = Console(width=160, file=io.StringIO(), color_system=None)
+    with console.capture() as shown:
+        console.print(past_view([plain | at | row for row in rows]))
+    found = [re.split(" {2,}", line.strip()) for line in shown.get().splitlines()[1:]]
+    assert [row[3:] for row in found] == [
+        ["raised high", "active", "85 %", "too fast"],
+        ["acknowledged", "active", "85 %", "Ana", "too fast"],
+        ["out of service", "normal", "85 %", "Bo", "out of service by Bo: rebuilt"],
+        ["folded", "normal", "85 %", "part of line:hall"],
+    ]
+
+
+def test_without_history_there_are_no_past_alarms(running: Path, command: Command) -> None:
+    done = command("alarms", running, "--past", "1d")
+    assert (done.code, "no history is kept here" in done.err) == (1, True), done.err
 
 
 @pytest.mark.parametrize(

@@ -331,6 +331,26 @@ async def test_an_alarm_is_shelved_and_listed_as_such(tokens: Path) -> None:
         assert [one["alarm"] for one in found] == ["mixer/speed"]
 
 
+async def test_past_alarms_come_newest_first_and_without_history_that_is_said(
+    tmp_path: Path,
+) -> None:
+    path = "/api/alarms/past?time=%5Bnow(-1h)..%5D&limit=2"
+    plant = alarmed()
+    async with serving(plant=plant) as client:
+        assert (await client.ask(path)).status == 503
+    with history(tmp_path / "history.db") as historian:
+        async with serving(plant=plant, history=historian) as client:
+            entries, at = plant.alarms.entries, time.time_ns()
+            for number, key in enumerate(("mixer/speed", "mixer/level", "mixer/flow")):
+                tag_ = entries[key].tag
+                assert tag_ is not None
+                plant.alarms.judge([good(tag_, 85, at + number)])
+            found = await client.ask(path)
+            assert [one["alarm"] for one in found.json["alarms"]] == ["mixer/flow", "mixer/level"]
+            assert violations(found.json, schema("/api/alarms/past", 200)) == []
+            assert (await client.ask("/api/alarms/past?time=now")).status == 400
+
+
 async def test_an_alarm_is_acknowledged_with_a_token_only(tokens: Path) -> None:
     path = "/api/alarms/acknowledge?alarm=mixer/speed"
     body = b'{"by": "Ana"}'

@@ -120,6 +120,16 @@ class Client:
             self.status()  # a gateway may have no alarms
         return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
+    def past_alarms(self, since: str) -> list[dict[str, Any]]:
+        """Returns the changes of alarms since a time as in `_time`, in the order of time. Raises
+        `GatewayError`, also without history."""
+        replies = self._answers(self._keys.status(f"alarms/**?_time=[{since}..]"))
+        for reply in replies:
+            if reply.err is not None:
+                raise GatewayError(str(document(reply.err.payload.to_bytes())["reason"]))
+        found = [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+        return sorted(found, key=lambda row: str(row["since"]))
+
     def order(self, alarm: str, order: Mapping[str, object]) -> dict[str, object]:
         """Returns the document of the alarm, or `error ...`. Raises as `write`."""
         key = self._keys.status(f"alarms/{alarm}")

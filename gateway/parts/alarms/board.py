@@ -207,9 +207,10 @@ class Alarms:
         """Puts an alarm back; `by` None: its time has ended. A repeat changes nothing."""
         now, at = asyncio.get_running_loop().time(), self._wall()
         entry.released_at, entry.by = math.inf, by
-        for event in (entry.alarm.release(at), entry.alarm.elapse(now, at)):
-            if event is not None:
-                self._report(entry, event)
+        if (event := entry.alarm.release(at)) is not None:
+            self._report(entry, event)
+        if (event := entry.alarm.elapse(now, at)) is not None:
+            self._report(entry, event)
 
     # -- life --
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
@@ -137,6 +138,10 @@ class AlarmPart:
             raise NoHistory
         for row in history.alarms(time_range, None, now):
             yield str(orjson.loads(row)["alarm"]), row
+
+    def past(self, time_range: str, most: int) -> Sequence[Mapping[str, Any]]:
+        newest = deque(self.recorded(time_range, self._plant.wall()), maxlen=most)
+        return [orjson.loads(row) for _, row in reversed(newest)]
 
     # -- operators --
 

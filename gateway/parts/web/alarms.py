@@ -7,11 +7,14 @@ from aiohttp import web
 
 from gateway.contract import payload
 from gateway.contract.problems import Failure, Problem
-from gateway.errors import BadValue
+from gateway.errors import BadValue, GatewayError
+from gateway.parts.web.connections import Places
 from gateway.parts.web.guard import BY
 from gateway.parts.web.routes import LIMIT, Choice, Route, Word, answer, body, json_off_loop, raw
 from gateway.parts.web.schemas import ref
 from gateway.plant.part import Core, Listed
+
+PAST_WAITING = 16, 4  # queries of the past at once and waiting, and of one client
 
 _STATE = Choice(
     "state",
@@ -20,6 +23,8 @@ _STATE = Choice(
     ("open", "suppressed", "all", "normal", "active", "acknowledged", "returned"),
 )
 _AFTER = Word("after", "Last alarm of the page before")
+_TIME = Word("time", "A range as in a query of Zenoh: [now(-1d)..], if left out")
+_NONE = "the alarms do not work now: see `faults` of /api/status"
 _ALARM = Word("alarm", "device/tag, device, or line:name", required=True)
 _ORDERS = (
     (
@@ -42,6 +47,8 @@ class AlarmApi:
     def __init__(self, core: Core) -> None:
         self._north = core.north
         self._others = core.others
+        self._places = Places(*PAST_WAITING, "queries of past alarms")
+        self._turn = asyncio.Semaphore()
 
     def routes(self) -> list[Route]:
         return [
@@ -52,6 +59,14 @@ class AlarmApi:
                 parameters=(_STATE, _AFTER, LIMIT),
                 reply=ref("Alarms"),
                 errors={400: "A wrong state or limit"},
+            ),
+            Route(
+                "/api/alarms/past",
+                self._past,
+                "Changes of alarms, the newest first",
+                parameters=(_TIME, LIMIT),
+                reply=ref("PastAlarms"),
+                errors={400: "A wrong time or limit", 503: "No history, or it cannot be read"},
             ),
             *(
                 Route(
@@ -84,11 +99,25 @@ class AlarmApi:
         most, after, state = LIMIT.of(request), _AFTER.of(request), _STATE.of(request) or "open"
         lists = self._others.each(Listed)
         if not lists:
-            return answer(503, "the alarms do not work now: see `faults` of /api/status")
+            return answer(503, _NONE)
         try:
             return await json_off_loop(partial(lists[0].page, state, after, most))
         except BadValue as error:
             return answer(400, str(error))
+
+    async def _past(self, request: web.Request) -> web.Response:
+        most, time_range = LIMIT.of(request), _TIME.of(request) or "[now(-1d)..]"
+        lists = self._others.each(Listed)
+        if not lists:
+            return answer(503, _NONE)
+        with self._places.taken(request.transport):
+            async with self._turn:
+                try:
+                    return await json_off_loop(lambda: {"alarms": lists[0].past(time_range, most)})
+                except BadValue as error:
+                    return answer(400, str(error))
+                except GatewayError as error:
+                    return answer(503, str(error) or "this gateway keeps no history")
 
     async def _order(self, request: web.Request) -> web.Response:
         arrived = asyncio.get_running_loop().time()

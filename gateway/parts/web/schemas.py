@@ -96,6 +96,7 @@ _OWN: Mapping[str, Schema] = {
             ),
         },
     ),
+    "PastAlarms": _record({"alarms": _list(ref("AlarmEvent"))}),
     "Alarms": _record(
         {"alarms": _list(ref("AlarmDocument")), "counts": ref("AlarmCounts"), "next": _NEXT}
     ),

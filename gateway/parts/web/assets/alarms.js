@@ -7,6 +7,7 @@ const SHORT = 6; // in the overview
 const PAGE = 1000; // alarms of one request
 const MOST = 5000;
 const EVERY = 4000; // ms between two requests for what is not in the events
+const PAST_EVERY = 10_000; // ms
 const LEVELS = {
   high_high: "far too high", high: "too high", low: "too low", low_low: "far too low", on: "on", off: "off",
   offline: "offline", down: "down", silent: "silent", stopped: "stopped",
@@ -23,6 +24,7 @@ export const onAlarms = (watcher) => watchers.push(watcher);
 on("state", async ({ alarms }) => {
   if (!alarms?.shown) return put("alarms-head", "The alarms do not work now");
   showSuppressed(alarms.suppressed);
+  showPast(PAST_EVERY);
   if (!alarms.more) return takeAll(alarms.shown);
   if (!all.length) takeAll(alarms.shown);
   if (performance.now() - asked < EVERY) return;
@@ -58,7 +60,25 @@ function showAll() {
   else if (!full && all.length > SHORT) list.append(h("li", {}, h("a", { href: "#alarms" }, `and ${all.length - SHORT} more`)));
 }
 
-addEventListener("hashchange", showAll);
+addEventListener("hashchange", () => { showAll(); showPast(); });
+byId("past-span").addEventListener("change", () => showPast());
+
+let pastAt = -Infinity; // performance.now() of the last request for it
+
+async function showPast(every = 0) {
+  if (byId("view-alarms").hidden || performance.now() - pastAt < every) return;
+  pastAt = performance.now();
+  const reply = await api("alarms/past", { time: `[now(-${byId("past-span").value})..]` }).catch(() => null);
+  if (!reply) return;
+  const rows = reply.ok ? reply.found.alarms : [];
+  put("past-why", reply.ok ? (rows.length ? "" : "Nothing.") : reply.found.error);
+  byId("past-list").replaceChildren(...rows.map((one) => {
+    const by = one.event === "acknowledged" ? one.acknowledged.by : one.by;
+    const reason = (one.shelved ?? one.out_of_service)?.reason ?? (one.part_of && `part of ${one.part_of}`);
+    const words = [one.alarm, one.change ?? one.event, by && `by ${by}`, reason ?? why(one)];
+    return h("li", { className: "soft" }, h("time", { dateTime: one.since }, moment(Date.parse(one.since))), ` ${words.filter(Boolean).join(" · ")}`);
+  }));
+}
 
 function why(one) {
   const limit = typeof one.limit === "number" ? ` (${one.limit})` : "";
