@@ -338,3 +338,28 @@ async def test_more_than_ten_alarms_in_ten_minutes_are_a_flood() -> None:
         assert floods() == []
     events = [one["event"] for one in logs if "flood" in one["event"]]
     assert events == ["alarm flood began", "alarm flood ended"]
+
+
+@on_virtual_time
+async def test_a_limit_may_be_the_value_of_another_tag(tmp_path: Path) -> None:
+    """As docs/alarms.md has it: the alarm of a difference."""
+    tags = {
+        "level": {"address": "D1"},
+        "most": {"address": "D2"},
+        "over": {"computed": "level - most", "alarm": {"high": 0, "hysteresis": 2}},
+    }
+    lines = {"hall": vigor_line("simulator", tags)}
+    gateway = Plant(load(write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)))
+    entry = alarms_of(gateway).alarms.entries["mixer/over"]
+    by_name = {tag.name: tag for device in gateway.config.devices for tag in device.tags}
+    for level, most, state in (
+        (50, 60, State.NORMAL),
+        (50, 50, State.ACTIVE),
+        (50, 51, State.ACTIVE),
+        (50, None, State.ACTIVE),  # nobody knows
+        (50, 52, State.RETURNED),
+    ):
+        limit = by_name["most"]
+        known = bad(limit, Reason.NO_REPLY, 1) if most is None else good(limit, most, 1)
+        gateway.samples([good(by_name["level"], level, 1), known])
+        assert entry.status.state is state
