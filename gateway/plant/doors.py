@@ -35,10 +35,12 @@ class Conditions:
 
     def __init__(self) -> None:
         self._by_owner: dict[str, dict[str, Condition]] = {}
+        self.version = 0  # grows with each change
 
     def put(self, owner: str, conditions: dict[str, Condition]) -> None:
         """Takes the place of all earlier conditions of the owner."""
         self._by_owner[owner] = conditions
+        self.version += 1
 
     def all(self) -> dict[str, Condition]:
         return {key: one for found in self._by_owner.values() for key, one in found.items()}

@@ -47,6 +47,7 @@ class AlarmPart:
         self.alarms = Alarms(core.plant.tags(), core.plant.wall)
         self._settings = core.config.part(AlarmsSection) or AlarmsSection()
         self._file = AlarmFile(self._settings.path, self.alarms)
+        self._known: tuple[object, ...] = ()  # what the conditions are of
         self.alarms.subscribe(self._changed)
 
     # -- life --
@@ -67,9 +68,13 @@ class AlarmPart:
 
     def _watch(self) -> None:
         """Follows the conditions of the plant and of other parts."""
-        found = self._plant.doors.conditions
+        found, lines = self._plant.doors.conditions, self._plant.lines
+        devices = [device for line in lines for device in line.engine.devices]
+        if self._known == (found.version, *lines, *devices):
+            return
         now = asyncio.get_running_loop().time
-        found.put("alarms", conditions(self._plant.lines, self.alarms.level, now))
+        found.put("alarms", conditions(lines, self.alarms.level, now))
+        self._known = (found.version, *lines, *devices)
         self.alarms.watch(tuned(found.all(), self._settings))
 
     async def take_over(self, config: Config, renewed: Mapping[Tag, Tag]) -> None:
