@@ -28,7 +28,7 @@ from gateway.tags.tag import NotReal
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
 _STYLES |= {"carried": "green", "waiting": "yellow", "stale": "red", "refused": "red"}
-_STYLES |= {"unclear": "red", "connected": "green", "dialling": "yellow"}
+_STYLES |= {"unclear": "red", "connected": "green", "dialling": "yellow", "doubtful": "yellow"}
 
 
 def status(
@@ -113,12 +113,14 @@ def _lines(documents: Documents) -> Table:
     table = _table("line", "state", "open for", "load", "expected", "requests/s", "slowest write")
     for name, document in below("lines/", documents):
         measured, expected = document["measured"], document["expected"]
+        doubtful = document.get("doubtful", False)
+        opened = "doubtful" if doubtful else "open"
         table.add_row(
             Text(name),
-            _state(origins.get(name, "open") if document["open"] else "down"),
+            _state(origins.get(name, opened) if document["open"] else "down"),
             Text(span(document["open_for"])),
             Text(_share(measured["load"])),
-            Text(_share(expected["load"])),
+            Text(_share(expected["load_proven" if doubtful else "load"])),
             Text(_number(measured["requests_per_second"])),
             Text(f"{measured['slowest_write']:.2f} s"),
         )

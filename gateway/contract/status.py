@@ -137,8 +137,10 @@ def line_document(
             "slowest_write": round(slowest, 4),
         },
         "unasked_bytes": record.unasked,
+        "doubtful": any(device.is_doubtful for device in engine.devices),
         "expected": {
             "load": round(expected.load, 4),
+            "load_proven": round(expected.load_proven, 4),
             "requests_per_second": round(expected.requests, 3),
             "cycle": round(expected.cycle, 4),
             "worst_write": round(expected.worst_write, 4),

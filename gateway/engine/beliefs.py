@@ -71,7 +71,7 @@ BELIEFS = (
         "answers twice",
         "a reply to no request",
         "no such reply for ten minutes",
-        "fewer shapes, shorter waits",
+        "reads of its line need no proof; fewer shapes, shorter waits",
         WARY_FOR,
     ),
     Belief(

@@ -12,6 +12,7 @@ from typing import Any, cast
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.records import LineRecord
+from gateway.engine.device.reply_shapes import WARY
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.jobs.jobs import (
     Answer,
@@ -38,7 +39,7 @@ from gateway.engine.results.request_rules import RequestRules
 from gateway.engine.results.rule import NEVER, Rules
 from gateway.engine.results.staleness import Staleness
 from gateway.engine.rules import LineState, rules_of
-from gateway.engine.schedule.in_flight import InFlight
+from gateway.engine.schedule.in_flight import HeldRead, InFlight
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import BadValue, Busy, LineDown, Superseded
 from gateway.planning.wire_timing import WireTiming
@@ -71,7 +72,7 @@ class Engine:
         self._effects = effects = Effects()
         self._in_flight = in_flight = InFlight()
         staleness = Staleness(self.schedule, effects)
-        health = HealthRules(name, self.schedule, staleness, effects)
+        health = HealthRules(name, self.schedule, in_flight, staleness, effects)
         self._polls = PollRules(self.schedule, health, effects)
         self._requests = RequestRules(self.schedule, health, effects)
         gap = max(GAP, 4 * wire.character)
@@ -141,7 +142,11 @@ class Engine:
         if isinstance(job, Poll):
             entry = in_flight.open.pop(job)
             if good:  # units are the only good result of a poll
-                self._polls.read(entry, cast("Sequence[int]", result), now, time)
+                units = cast("Sequence[int]", result)
+                if (shapes := job.device.shapes) is not None and shapes.quiet == WARY:
+                    self._next_job.hold(HeldRead(entry, units, now, time, traffic.extra > 0))
+                else:
+                    self._polls.read(entry, units, now, time)
             else:
                 self._next_job.poll_failed(entry, result, now, time)
             if in_flight.open:

@@ -42,6 +42,7 @@ class LineForecast:
     wire: WireTiming
     blocks: tuple[BlockForecast, ...]
     load: float  # share of the wire time; 1.0: all of it
+    load_proven: float  # the same while each read needs a proof, because extra replies arrive
     requests: float  # per second
     characters: float  # per second, both ways
     cycle: float  # one poll of every block
@@ -56,7 +57,8 @@ class LineForecast:
         """Returns the forecast with writes that the gateway sends by itself."""
         more = sum(one.often * one.seconds for one in writes)
         often = sum(one.often for one in writes)
-        return replace(self, load=self.load + more, requests=self.requests + often)
+        proven, requests = self.load_proven + more, self.requests + often
+        return replace(self, load=self.load + more, load_proven=proven, requests=requests)
 
     @property
     def overloaded(self) -> bool:
@@ -94,6 +96,7 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
             for one, age in zip(blocks, worst_ages(blocks), strict=True)
         ),
         load=load,
+        load_proven=load + sum(one.device.proof_seconds / one.block.every for one in blocks),
         requests=requests,
         characters=sum(sum(one.block.cost) / one.block.every for one in blocks),
         cycle=cycle,

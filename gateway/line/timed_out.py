@@ -58,7 +58,8 @@ class LateReply:
     async def settle(self, guard: float, gap: float) -> Settled:
         """Waits until the late reply has arrived, or for `guard` seconds.
 
-        After noise: until `gap` seconds have passed without a byte, at most `guard`.
+        After noise: until `gap` seconds have passed without a byte, at most `guard`. Raises
+        `LineDown` if the port is lost then.
         """
         channel, start = self.channel, self.channel.now()
         until = start + guard
@@ -67,6 +68,8 @@ class LateReply:
             if min(quiet, until) <= channel.now():
                 return Settled(late=None, quiet=quiet <= channel.now())
             await self._wait(min(quiet, until))
+        if self.answers is None and channel.lost_by is not None:
+            raise channel.lost_by
         if self.arrived:
             return Settled(late=0.0)
         if channel.lost_by is None:

@@ -7,6 +7,7 @@ from gateway.engine.effects import Effects, LogEvent
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.staleness import Staleness
 from gateway.engine.results.stray import LOG_EVERY, PAUSE, Stray
+from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.schedule import Schedule
 from gateway.protocols.computer_link.codec import Ack, Text
 from gateway.protocols.driver import Span
@@ -25,7 +26,7 @@ class StrayLine:
         self.effects = Effects()
         schedule = Schedule(devices, 0.0)
         staleness = Staleness(schedule, self.effects)
-        results = HealthRules("line", schedule, staleness, self.effects)
+        results = HealthRules("line", schedule, InFlight(), staleness, self.effects)
         self.stray = Stray("line", devices, results, self.effects)
         for one in devices:
             one.monitor.must_register(LIST)

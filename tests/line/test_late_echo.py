@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from gateway.engine.device.health import State
+from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.errors import Unclear
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.tags import WriteResult
@@ -33,7 +34,7 @@ async def test_an_echo_that_begins_later_acknowledges_no_write(driver: Driver) -
             await asyncio.sleep(5)
             assert isinstance(done.once, Unclear)
             line.bench.echo = line.stations[0].mute = False
-            await asyncio.sleep(120)
+            await asyncio.sleep(2 * WARY_FOR)  # the echo was an extra reply
             assert line.now[tag].value == before
 
 

@@ -164,7 +164,7 @@ async def test_late_refusals_acknowledge_no_write(
             await asyncio.sleep(0.7)
     assert false == []
     good = [s for _, s in line.reported if s.quality is Quality.GOOD]
-    assert len(good) > 300
+    assert len(good) > 150  # late replies are extra ones: each read has a proof
     assert all(sample.value in held[sample.tag.address.number] for sample in good)
 
 

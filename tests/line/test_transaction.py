@@ -1,6 +1,7 @@
 """One transaction: time-outs, late replies, echoes, noise and lost ports."""
 
 import asyncio
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -248,7 +249,8 @@ async def test_port_loss_ends_the_settling(garbled: bool) -> None:
     await asyncio.sleep(0.001)
     talk.lost(LineDown("gone"))
     start = now()
-    await settling
+    with suppress(LineDown):  # a silence that was not waited for shows nothing
+        await settling
     assert now() - start <= 0.02
 
 

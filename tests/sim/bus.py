@@ -1,5 +1,6 @@
 """One line of the simulation: its traffic, and the excuses for what the gateway reports."""
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -46,6 +47,7 @@ UNTIMELY = (
     *PARTIES,
 )
 SPOKE_LATELY = 1.0 + 0.7  # seconds: the reply to an unsolicited frame comes within one
+SPOKEN = 0.45  # seconds: the longest request and reply of a seed, with an echo and a gap
 AFTER_ALL = 0.09  # seconds that stations need after a broadcast
 
 
@@ -70,6 +72,7 @@ class Bus:
     hurt: dict[str, float] = field(default_factory=lambda: {"<": -1.0, ">": -1.0})
     heard: bytes = b""  # since the gateway sent last
     request: bytes = b""  # as it reached the stations
+    own: list[bytes] = field(default_factory=list)  # replies of its stations since then
     writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
     carried: Counter[int] = field(default_factory=Counter)  # at most so many of transfers, or twice
     commands: Counter[int] = field(default_factory=Counter)
@@ -83,6 +86,7 @@ class Bus:
     )  # the last unsolicited frame that the gateway could hear
     _to_all_until: float = -1.0
     _registering: Device | None = None
+    _proves: bool = False  # the last request proves the read before
 
     def __post_init__(self) -> None:
         self.foreign = Foreign(lambda data: shape_of(protocol_of(self.protocol, data), data))
@@ -92,7 +96,11 @@ class Bus:
     def sent(self, data: bytes, start: float, end: float) -> None:
         if self._registering is not None:
             self._registered(self._registering)
-        self.sent_at, self.heard, self.request = start, b"", b""
+        # Private: no document tells it.
+        self._proves = proves = self.line.engine._in_flight.held is not None
+        if not proves:
+            self.sent_at, self.heard, self.request = start, b"", b""
+            self.own.clear()
         protocol = protocol_of(self.protocol, data)
         number = station_in(protocol, data)
         self.note("sent", self.config.name, data)
@@ -109,7 +117,8 @@ class Bus:
             return
         self.asked = named[0]
         health = self.asked.health
-        self.foreign.sent(data, start, resync=health.needs_resync or not health.online)
+        resync = health.needs_resync or not health.online
+        self.foreign.sent(data, start, resync=resync, proves=proves)
         poll = not (is_write(protocol, data) or is_command(protocol, data) or health.needs_resync)
         self._check_silence(named[0], start, poll=poll)
         self.writes[number] += is_write(protocol, data)
@@ -124,6 +133,19 @@ class Bus:
         heard = begin + 0.001 < start < min(until - 0.001, begin + 1.0)
         if heard and self.hurt["<"] < begin - 0.1:
             self.broke(f"{self.config.name}: spoke into a frame that was coming in")
+
+    @property
+    def proof(self) -> float:
+        """Seconds that the proof of the last read may have taken; 0.0: it had none."""
+        if not self._proves or self.asked is None:
+            return 0.0
+        return self.asked.timing.reply_timeout + SPOKEN + 4 * self.asked.longest_reply
+
+    @property
+    def evidence_at(self) -> float:
+        """When the gateway saw an extra reply last, as long as it doubts the line."""
+        shapes = [device.shapes for device in self.line.engine.devices if device.shapes]
+        return max((one.wary_at for one in shapes if one.is_wary), default=-math.inf)
 
     def _check_silence(self, device: Device, start: float, *, poll: bool) -> None:
         """Checks that the silence before a request other than a poll is not shortened."""
@@ -178,6 +200,7 @@ class Bus:
             self.request += data
 
     def answered(self, request: bytes, reply: bytes) -> None:
+        self.own.append(reply)
         self.foreign.answered(request, reply)
 
     def repeated(self) -> None:

@@ -20,13 +20,15 @@ from pathlib import Path
 
 from tests.sim import liveness, north
 from tests.sim.draw import PACES
+from tests.sim.foreign import Case
 from tests.sim.north_clients import GROUPS
 from tests.sim.story import Story
 from tests.sim.world import run
 
 NORTH, LIVENESS = "north", "liveness"  # paces of the worlds of `north.py` and `liveness.py`
 MOST = ("most timers", "most open")  # counts of which the largest is printed
-WORDS = ("frames", "good samples", "foreign answers")  # counts in the total
+# Counts in the total.
+WORDS = ("frames", "good samples", *(case.value for case in Case if case.value), "internal errors")
 NORTH_WORDS = ("published", "received", "lost by congestion", "answers", "pages", "executed")
 
 
@@ -120,6 +122,9 @@ def main() -> int:
                 print(_line(story), flush=True)
             if story.broken and chosen.first:
                 break
+    for story in known:
+        if wrong := {case.value: n for case in Case if (n := story.counts[case.value])}:
+            print(f"{story.seed}: {', '.join(f'{n} {what}' for what, n in wrong.items())}")
     if len(chosen.seeds) == 1:
         for story in known:
             print("\n".join(story.broken))

@@ -51,7 +51,11 @@ class Expectations:
             max(d.timing.reply_timeout + d.settings.late_guard for d in line.engine.devices)
             + SPOKEN
         )
-        return longest, max(1.0, sum(d.load for d in line.engine.devices))
+        load = sum(d.load for d in line.engine.devices)
+        for device in line.engine.devices:  # each read is proven
+            if device.is_doubtful:
+                load += sum(device.proof_seconds / block.every for block in device.blocks)
+        return longest, max(1.0, load)
 
     def every(self, bus: Bus, device: Device, tag: Tag) -> float:
         """Returns the seconds between two samples of the tag."""

@@ -5,10 +5,21 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum
 
 APART = 0.25  # seconds between two questions, after which an older answer cannot be told
 SECONDS_APART = 3.0  # between a second answer and the last answer that it displaced
+CLEAN = 600.0  # seconds without a foreign reply, after which one more scan may be wrong
 Shape = tuple[object, ...]
+
+
+class Case(Enum):
+    """A scan with the values of a foreign reply. The text is the count in the total."""
+
+    FIRST = "wrong scans before evidence"
+    SAME = ""  # another tag of that scan
+    SECOND = "wrong again before evidence"
+    AFTER = "wrong scans after evidence"
 
 
 @dataclass(eq=False)
@@ -36,15 +47,21 @@ class Foreign:
     unknown_at: float = -1.0  # when an unknown station answered the open question last
     _others: list[tuple[bytes, bytes]] = field(default_factory=list)  # since then, with replies
     second_at: float = -math.inf  # when a second answer to a question was given last
+    evidence_at: float = -math.inf  # when a reply to no request arrived last
+    _wrong_at: float = -math.inf  # the last wrong scan
     _own: deque[tuple[bytes, bytes]] = field(default_factory=lambda: deque(maxlen=64))
     _asked: deque[tuple[float, bytes]] = field(default_factory=lambda: deque(maxlen=64))
 
-    def sent(self, request: bytes, now: float, *, resync: bool) -> None:
-        """The gateway asks. Other masters do not repeat its resyncs."""
-        self.asked = request
-        self._asked.append((now, request))
+    def sent(self, request: bytes, now: float, *, resync: bool, proves: bool) -> None:
+        """The gateway asks; `proves`: to prove the answer to the question before.
+
+        Other masters do not repeat its resyncs.
+        """
         self.asks.set()
-        self._others.clear()
+        if not proves:
+            self.asked = request
+            self._asked.append((now, request))
+            self._others.clear()
         if not resync and request not in self.reads and self.shape_of(request):
             self.reads.append(request)
 
@@ -62,6 +79,15 @@ class Foreign:
         self._others.append((request, reply))
         if unknown:
             self.unknown_at = now
+
+    def wrong_scan(self, now: float) -> Case:
+        """Returns what is wrong about a scan with the values of a foreign reply."""
+        before, self._wrong_at = self._wrong_at, now
+        if before == now:
+            return Case.SAME
+        if now - self.evidence_at < CLEAN:
+            return Case.AFTER
+        return Case.FIRST if before <= self.evidence_at else Case.SECOND
 
     def repeated(self, now: float) -> None:
         """A reply to the gateway will arrive a second time."""

@@ -10,14 +10,14 @@ from gateway.protocols.driver import Span
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Reason, Sample, Tag
-from tests.sim.bus import Bus, summed
+from tests.sim.bus import SPOKEN, Bus, summed
+from tests.sim.foreign import Case
 from tests.sim.gadgets import Gadget
 from tests.sim.net import SimNet
 from tests.sim.stations import Troubled
 from tests.sim.story import Story
 from tests.sim.wire import SimWire
 
-SPOKEN = 0.45  # seconds: the longest request and reply of a seed, with an echo and a gap
 LONGEST_STEP = 16  # addresses by which the gateway reads more, to change the shape
 MOST_TROUBLES = 20  # recorded in one run
 
@@ -34,6 +34,7 @@ class Judge:
     read_at: dict[Tag, float] = field(default_factory=dict)  # when it was last good
     foreign_at: dict[Tag, float] = field(default_factory=dict)  # when a value was foreign
     online: dict[str, bool] = field(default_factory=dict)
+    failures: set[tuple[float, str]] = field(default_factory=set)  # lines with internal errors
 
     def __post_init__(self) -> None:
         self._plain = self.gateway.samples
@@ -55,10 +56,13 @@ class Judge:
         for sample in samples:
             if sample.quality is Quality.GOOD:
                 self._judge(sample)
-            elif (
-                "another station" in sample.detail
-                and isinstance(self.buses[sample.tag.device].wire, SimNet)
-            ) or (sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail):
+            elif sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail:
+                self.failures.add((self.now, self.buses[sample.tag.device].config.name))
+                self.story.counts["internal errors"] = len(self.failures)
+                self.broke(f"{sample.tag.key}: {sample.detail}")
+            elif "another station" in sample.detail and isinstance(
+                self.buses[sample.tag.device].wire, SimNet
+            ):
                 self.broke(f"{sample.tag.key}: {sample.detail}")
         self._plain(samples)
 
@@ -95,16 +99,33 @@ class Judge:
         ):
             self.story.counts["stale reads of frames"] += 1  # their frames name no request
         elif bus.foreign.took(bus.heard):
-            self.story.counts["foreign answers"] += 1
-            self.foreign_at[tag] = self.now
+            self._took_foreign("foreign answers", tag, bus)
         elif bus.foreign.took_older(bus.heard, self._shapes(tag, bus), self.now):
-            self.story.counts["older answers"] += 1
-            self.foreign_at[tag] = self.now
+            self._took_foreign("older answers", tag, bus)
         else:
             self.broke(
                 f"{tag.key} is told as good {value!r}, which was not in the PLC since "
                 f"{since - self.began:.3f}: heard {bus.heard!r}"
             )
+
+    def _took_foreign(self, what: str, tag: Tag, bus: Bus) -> None:
+        """One scan may be wrong before the gateway heard a reply to no request; none after it.
+
+        No one can tell a second station with this number that replies alone.
+        """
+        self.story.counts[what] += 1
+        self.foreign_at[tag] = self.now
+        bus.foreign.evidence_at = bus.evidence_at
+        if bus.foreign.unknown_at >= bus.sent_at and not any(map(bus.heard.__contains__, bus.own)):
+            self.story.counts["foreign answers alone"] += 1
+            return
+        case = bus.foreign.wrong_scan(self.now)
+        if case is Case.SAME:
+            return
+        self.story.counts[case.value] += 1
+        if case is not Case.FIRST:
+            ago = self.now - max(bus.foreign.evidence_at, self.began)
+            self.broke(f"{tag.key}: a foreign reply is a value, {case.value} ({ago:.1f} s)")
 
     def _shapes(self, tag: Tag, bus: Bus) -> int:
         """Counts the shapes of which the gateway can choose to read the tag: three at most."""
@@ -123,7 +144,10 @@ class Judge:
         """A reply that came after its time-out counts for nothing, also after a frozen loop."""
         device = next(d for d in bus.line.engine.devices if d.name == tag.device)
         serial = isinstance(bus.wire, SimWire)  # on TCP a reply has the number of its question
-        if serial and took > device.timing.reply_timeout + SPOKEN:
+        limit = device.timing.reply_timeout + SPOKEN
+        if bus.proof:  # the loop may stand still between the reply and its proof
+            limit += bus.proof + bus.stood_still(bus.proof)
+        if serial and took > limit:
             self.broke(f"{tag.key} came after its time-out, {took:.2f} s after its question")
 
     def _judge_unasked(self, sample: Sample, bus: Bus) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 # Words of a report, and the rule of docs/proof.md that it breaks.
 _RULES = {
     "transfer ": "transfer",
+    "a foreign reply is a value": "foreign reply",
+    "internal error": "internal error",
     "which was not in the PLC": "wrong value",
     "which was not said": "wrong value",
     "is not fresh": "wrong value",

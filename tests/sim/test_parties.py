@@ -22,7 +22,7 @@ ASK, LIKE, OTHER = b"A1", b"A2", b"B1"  # the letter is the shape
 
 def watched() -> Foreign:
     foreign = Foreign(lambda request: (request[:1],))
-    foreign.sent(ASK, 1.0, resync=False)
+    foreign.sent(ASK, 1.0, resync=False, proves=False)
     return foreign
 
 
@@ -49,7 +49,7 @@ def test_an_answer_after_an_older_own_one_can_be_told() -> None:
 def test_an_answer_before_the_question_can_be_told() -> None:
     foreign = watched()
     foreign.answered_other(LIKE, b"=2", 1.0, unknown=False)
-    foreign.sent(ASK, 1.0, resync=False)
+    foreign.sent(ASK, 1.0, resync=False, proves=False)
     assert not foreign.took(b"=2")
 
 

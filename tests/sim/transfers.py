@@ -41,6 +41,7 @@ class _Row:
     at: float = -1.0  # when this write began; before: none was
     sure: bool = False  # it was acknowledged
     instead: bool = False  # it was the substitute
+    early: bool = False  # it may have been
     changed_at: float = 0.0  # when the source was published with another good value
     seen: Value | None = None
     ends: Counter[str] = field(default_factory=Counter)
@@ -89,13 +90,16 @@ class Carrier:
         if tag.device not in self.devices:  # disabled
             row.ends["disabled"] += 1
             return await self._plain(tag, value, by, within)
-        self._judge_value(row, value, fresh=fresh)
+        early = fresh and value == row.rule.substitute and self._may_be_stale(row)
+        if not early:
+            self._judge_value(row, value, fresh=fresh)
         station, since = judge.stations[tag.device], judge.now
         read_at = judge.read_at.get(row.source, since)
         known, held = counts(station, tag), shown(tag, station.holds(tag))
         self._count(tag)
         row.writing, before = True, (row.written, row.at, row.sure, row.instead)
         row.written, row.at, row.sure, row.instead = value, since, False, not fresh
+        row.early = early
         try:
             end: WriteResult | GatewayError = await self._plain(tag, value, by, within)
         except GatewayError as error:
@@ -126,15 +130,19 @@ class Carrier:
         age = self.judge.now - self.judge.read_at.get(row.source, -math.inf)
         return sample.quality is Quality.GOOD and age < row.rule.stale
 
+    def _may_be_stale(self, row: _Row) -> bool:
+        """The gateway may count the age from an earlier read: after a new plan from the oldest one
+        of all tags that are read together now."""
+        age = self.judge.now - self.judge.read_at.get(row.source, -math.inf)
+        return age >= row.rule.stale - row.source.every
+
     def _judge_value(self, row: _Row, value: Value, *, fresh: bool) -> None:
         judge, rule, name = self.judge, row.rule, f"transfer {row.rule.number}"
         sample = judge.gateway.mirror[row.source]
         read_at = judge.read_at.get(row.source, judge.began)
         if not fresh:
-            age = judge.now - read_at
-            # The gateway may count the age from an earlier moment of the same poll.
-            least = rule.stale - row.source.every
-            if value != rule.substitute or age < least:
+            if value != rule.substitute or not self._may_be_stale(row):
+                age = judge.now - read_at
                 judge.broke(
                     f"{name} carried {value!r} of {sample}, {age:.1f} s after its last read"
                 )
@@ -142,7 +150,7 @@ class Carrier:
                 judge.broke(f"{name} carried its substitute twice")
         elif value != _expected(rule, sample.value):
             judge.broke(f"{name} carried {value!r} in place of {sample.value!r}")
-        elif rule.every is None and row.at >= 0.0 and not row.instead:
+        elif rule.every is None and row.at >= 0.0 and not (row.instead or row.early):
             if row.sure and value == row.written:
                 judge.broke(f"{name} carried {value!r} twice")
             elif judge.now - row.at < row.source.every - LOOP:
@@ -174,7 +182,7 @@ class Carrier:
         fresh, state = self._fresh(row), said["state"]
         self.judge.story.counts[f"transfers {state}"] += 1
         right = state == "starting" if not row.ends else fresh is (state != "stale")
-        right = right or (state == "stale" and not fresh)
+        right = right or (state == "stale" and self._may_be_stale(row))
         right = right and (state != "carried" or row.sure) and said["carried"] == row.ends[_DONE]
         right = right or row.ends["disabled"] > 0
         if not right and not row.writing:

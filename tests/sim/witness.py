@@ -1,6 +1,5 @@
 """Checks every good value against the clock of the stations' memory."""
 
-import asyncio
 from collections.abc import Sequence
 
 from gateway.tags import Quality, Sample
@@ -20,12 +19,11 @@ class Witness:
         plant.listeners.append(self.samples)
 
     def samples(self, samples: Sequence[Sample]) -> None:
-        now = asyncio.get_running_loop().time()
-        began = self.plant.bench.sent[-1][0] if self.plant.bench.sent else 0.0
         for sample in samples:
             if sample.quality is not Quality.GOOD:
                 continue
-            value = sample.value
+            value, now = sample.value, sample.time / 1e9  # a proof may have followed the reply
+            began = next((at for at, _ in reversed(self.plant.bench.sent) if at < now), 0.0)
             assert isinstance(value, int)
             age = (clock_word(now, sample.tag.address.number) - value) % 65536
             if age <= (now - began) * 1000 + 1:

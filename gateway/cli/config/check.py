@@ -174,7 +174,15 @@ def _line(line: LineForecast) -> Text:
         f"  load {line.load:.1%} of the wire; one round of all requests takes {seconds(line.cycle)}"
         + writes
         + returned
+        + _proven(line)
     )
+
+
+def _proven(line: LineForecast) -> str:
+    """Returns the load while extra replies arrive."""
+    if line.load_proven == line.load:  # all replies carry a number
+        return ""
+    return f"\n  load {line.load_proven:.1%} after an extra reply: each read is proven then"
 
 
 def _blocks(line: LineForecast) -> Table:

@@ -38,6 +38,7 @@ class Measured(TypedDict):
 
 class Expected(TypedDict):
     load: float
+    load_proven: NotRequired[float]
     requests_per_second: float
     cycle: float
     worst_write: float
@@ -75,6 +76,7 @@ class LineDocument(TypedDict):
     busy_time: float
     measured: Measured
     unasked_bytes: int
+    doubtful: NotRequired[bool]
     expected: Expected
     calls: CallsDocument | None
     served: NotRequired[bool]

@@ -32,6 +32,8 @@ ANSWERS_TWICE = (
     "device server repeats replies"
 )
 ECHO_PROVEN_FOR = 2.0  # seconds after which an adapter may echo that did not before
+QUIET_MARGIN = 0.05  # seconds that a station may take longer than usual
+PROOF_COST = Cost(20, 30)  # characters of a resync, about
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
 
 
@@ -198,6 +200,21 @@ class Device:
         """Seconds of its longest poll."""
         longest = max((self.seconds(block.cost) for block in self.blocks), default=0.0)
         return longest * self.settings.verify_reads
+
+    @property
+    def settled_after(self) -> float:
+        """Seconds without a byte after which no reply to its last requests is under way."""
+        return self.longest_poll + QUIET_MARGIN
+
+    @property
+    def proof_seconds(self) -> float:
+        """Seconds that prove a read while extra replies arrive, about; 0: replies are numbered."""
+        return 0.0 if self.shapes is None else self.seconds(PROOF_COST) + self.settled_after
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True while extra replies arrive on its line: each of its reads is proven."""
+        return self.shapes is not None and self.shapes.is_wary
 
     @property
     def load(self) -> float:

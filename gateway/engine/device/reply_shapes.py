@@ -33,8 +33,7 @@ class ReplyShapes:
         "_driver",
         "_mark",
         "_recent",
-        "_refused",
-        "_told_all_until",
+        "_unclear_until",
         "_used",
         "at",
         "extra_at",
@@ -44,6 +43,7 @@ class ReplyShapes:
         "proven",
         "quiet",
         "span",
+        "wary_at",
     )
 
     def __init__(self, driver: UnnumberedReplies, longer: LongerReads) -> None:
@@ -57,8 +57,9 @@ class ReplyShapes:
         self.proven = 0.0  # values read before are no extra replies
         self.mark_due = 0.0  # when a resync must show the order, if the wire is not quiet before
         self.extra_at = -NEVER  # when an extra reply arrived
-        self._refused = -NEVER  # when the last error reply arrived
-        self._told_all_until = -NEVER  # until then a reply to a broadcast may arrive
+        self.wary_at = -NEVER  # the same for any device of the line
+        # Until then one more error reply may arrive, or the reply to a broadcast
+        self._unclear_until = -NEVER
         self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
         self._mark = MARK_FIRST
         self._driver = driver
@@ -141,7 +142,7 @@ class ReplyShapes:
             replies = (self._driver.reply_shape(span), None)
         before, after = False, self.may_be_extra(replies[-1], now)
         for shape in replies[:-1]:
-            before = now - self._used.get(shape, -NEVER) < self.quiet
+            before = self.is_wary or now - self._used.get(shape, -NEVER) < self.quiet
             self._used[shape] = now
         self._sent(replies[-1], now)
         return before, after
@@ -159,11 +160,11 @@ class ReplyShapes:
 
         `shape` of the expected reply; None: unknown.
         """
-        if now < self._told_all_until:
+        if self.is_wary or now < self._unclear_until:
             return True
         acked, at = self._acked
         alike = shape == acked or shape is None or acked is None
-        return (alike and now - at < self.quiet) or now - self._refused < self.quiet
+        return alike and now - at < self.quiet
 
     def acknowledged(self, now: float) -> None:
         """Notes that the last request, a write or command, was acknowledged."""
@@ -171,11 +172,11 @@ class ReplyShapes:
 
     def refused(self, now: float) -> None:
         """Notes an error reply."""
-        self._refused = now
+        self.told_all(now + self.quiet)
 
     def told_all(self, until: float) -> None:
         """Notes a broadcast, to which the station may reply until then."""
-        self._told_all_until = until
+        self._unclear_until = max(self._unclear_until, until)
 
     def marked(self, now: float) -> None:
         """Notes a resync: its reply shows that no extra reply is waiting."""
@@ -184,15 +185,24 @@ class ReplyShapes:
 
     def _prove(self, now: float) -> None:
         self.proven, self.mark_due = now, now + self._mark
-        if now - self.extra_at >= WARY_FOR:
+        if now - self.wary_at >= WARY_FOR:
             self.quiet = QUIET
         if now >= self.longer.forget_at:
             self.longer.forget(now)
 
     def extra_arrived(self, now: float) -> None:
         """Notes an extra reply."""
-        self.extra_at, self.quiet = now, WARY
-        self._mark = MARK_FIRST
+        self.extra_at, self._mark = now, MARK_FIRST
+        self.doubt(now)
+
+    def doubt(self, now: float) -> None:
+        """Notes an extra reply of any device of the line: from now on each read needs a proof."""
+        self.wary_at, self.quiet = now, WARY
+
+    @property
+    def is_wary(self) -> bool:
+        """True if an extra reply arrived on the line, and it was not clean for long since."""
+        return self.quiet == WARY
 
     @property
     def answers_twice(self) -> bool:

@@ -7,6 +7,7 @@ from gateway.engine.device.health import Heard, State
 from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.effects import Effects
 from gateway.engine.results.staleness import Staleness
+from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import DeviceError, Offline
 from gateway.protocols.driver import Span
@@ -17,10 +18,16 @@ class HealthRules:
     """The rules for every reply and every unclear end, of polls, probes and requests."""
 
     def __init__(
-        self, line: str, schedule: Schedule, staleness: Staleness, effects: Effects
+        self,
+        line: str,
+        schedule: Schedule,
+        in_flight: InFlight,
+        staleness: Staleness,
+        effects: Effects,
     ) -> None:
         self._line = line
         self._schedule = schedule
+        self._in_flight = in_flight
         self._staleness = staleness
         self._effects = effects
 
@@ -126,10 +133,15 @@ class HealthRules:
         quiet stay good: an extra reply would have arrived then.
         """
         health, shapes = device.health, device.shapes
-        if shapes is None or health.needs_resync or not health.online:
+        if shapes is None:
+            return
+        if not self._in_flight.doubts(device) and (health.needs_resync or not health.online):
             return  # the reply to an older request, which the resync expects
         known, why = shapes.answers_twice, ANSWERS_TWICE.format(station=device.driver.station)
         suspect = now - shapes.at < shapes.quiet
+        for other in self._schedule.devices:
+            if other.shapes is not None:
+                other.shapes.doubt(now)
         shapes.extra_arrived(now)
         health.answered_twice(shapes.span, now)
         log = self._effects.debug if known else self._effects.warning

@@ -1,6 +1,7 @@
 """Applies the result of a job that is no good read, and decides what follows it."""
 
 from gateway.engine.device.health import State
+from gateway.engine.device.reply_shapes import SHOWN
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import (
     Answer,
@@ -27,7 +28,7 @@ from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.request_rules import RequestRules
-from gateway.engine.schedule.in_flight import InFlight
+from gateway.engine.schedule.in_flight import HeldRead, InFlight
 from gateway.errors import (
     BadValue,
     DeviceError,
@@ -40,6 +41,7 @@ from gateway.errors import (
 )
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
+UNPROVEN = "extra replies arrive on this line, and nothing proves this read"
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
 
 
@@ -90,6 +92,45 @@ class NextJob:
             case Exception():
                 raise result
 
+    def hold(self, read: HeldRead) -> None:
+        """Holds the values of a good read until a resync proves it: its line has extra replies.
+
+        If another reply was taken for its own, its own is outstanding, and arrives before that to
+        the resync.
+        """
+        device, now = read.poll.device, read.now
+        health, shapes = device.health, device.shapes
+        health.left_outstanding(read.poll.job.span, now)
+        probe = Probe(device, health.outstanding, health.next_probe_token())
+        if shapes is not None:
+            shapes.probed(probe.outstanding, probe.token, device.probe_spans, now)
+        self._in_flight.hold(read)
+        self._in_flight.follow(probe)
+
+    def _proven(self, told_from: int, now: float, time: int) -> None:
+        """Releases the read that waited for this resync, if no extra reply has arrived.
+
+        The reply to the resync may be another one, too, unless its like exists only once. Then
+        the wire must be quiet after it: the own replies would arrive.
+        """
+        held = self._in_flight.held
+        if held is None or (shapes := held.poll.device.shapes) is None:
+            return
+        if held.doubted or told_from == EVERY_REQUEST or now - shapes.wary_at >= SHOWN:
+            self._release(now, time)
+            return
+        device = held.poll.device
+        guard = device.longest_reply + device.settled_after
+        self._in_flight.follow(Settle(device, guard, device.settled_after, held.poll.job))
+
+    def _release(self, now: float, time: int, *, proven: bool = True) -> None:
+        """Ends the read that waited for a proof, if there is one."""
+        held = self._in_flight.release()
+        if held is not None and proven and not held.doubted:
+            self._polls.read(held.poll, held.units, held.now, held.time)
+        elif held is not None:
+            self._polls.unsteady(held.poll, Unsteady(UNPROVEN), now, time)
+
     def polls_ended(self, traffic: Traffic, now: float, time: int) -> None:
         """Applies the end of a transaction of polls, some of which failed."""
         first, error = self._in_flight.failed[0]
@@ -138,6 +179,7 @@ class NextJob:
                         self.inherits = False
                         device.health.inherit(inherits=False)
                     self._results.answered(device, now, time, resynced=True)
+                    self._proven(EVERY_REQUEST if probe.again else told_from, now, time)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
             case LineDown():  # its reply may still arrive, on the next connection
@@ -170,6 +212,7 @@ class NextJob:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
+        self._release(now, time, proven=False)
         known = isinstance(job, Poll) or (isinstance(job, Probe) and job.token != PROOF)
         before = self._results.unclear(device, error, span_of(job), now, time, known=known)
         no_guard = before is State.OFFLINE or _is_short(job) or _is_lost(job, error, now)
@@ -187,7 +230,9 @@ class NextJob:
     def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
         device, after = settle.device, settle.after
         if settle.error is None:
-            if isinstance(result, Settled) and not result.quiet:
+            if isinstance(after, Poll):
+                self._release(now, time, proven=isinstance(result, Settled) and result.quiet)
+            elif isinstance(result, Settled) and not result.quiet:
                 self.inherits = False  # it is another master that speaks
                 device.health.inherit(inherits=False)
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)

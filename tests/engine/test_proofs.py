@@ -1,0 +1,225 @@
+"""From the first extra reply on, the values of each read of the line wait for its proof."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.device.reply_shapes import SHOWN, WARY_FOR
+from gateway.engine.forecast import forecast
+from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
+from gateway.engine.results.next_job import UNPROVEN
+from gateway.errors import Refusal, Refused
+from gateway.protocols.computer_link.codec import Ack
+from gateway.protocols.driver import EVERY_REQUEST
+from gateway.tags import Quality
+from tests.engine.rig import LOST, REPLIED, SECOND, SILENCE, Rig, link_device, tcp_device
+from tests.sim.bench import WIRE
+
+REFUSED = Refused("it lacks the address", code="06", refusal=Refusal.ADDRESS)
+
+
+def hear(rig: Rig, station: int = 1) -> None:
+    """Brings a reply to no request."""
+    extra: Any = Ack(station)
+    rig.note(rig.engine.unmatched(rig.devices[station - 1], extra, rig.now, rig.time))
+
+
+def doubtful(*devices: Device) -> Rig:
+    """A line whose first device has answered twice. The reads before were judged."""
+    rig = Rig(*devices)
+    while any(device.state is not State.ONLINE for device in rig.devices):
+        job = rig.transacted()
+        rig.conclude(job, [7] * job.span.size if isinstance(job, Poll) else Resynced(EVERY_REQUEST))
+    hear(rig)
+    return rig
+
+
+def read(rig: Rig, of: Device | None = None) -> Poll:
+    """Performs the next poll of the device. Its values have no proof yet."""
+    for _ in range(20):
+        job = rig.transacted()
+        if isinstance(job, Poll) and of in (None, job.device):
+            rig.samples.clear()
+            rig.conclude(job, [7] * job.span.size)
+            return job
+        rig.conclude(job, [7] * job.span.size if isinstance(job, Poll) else Resynced(EVERY_REQUEST))
+    raise AssertionError("not polled")
+
+
+def prove(rig: Rig, told_from: int = EVERY_REQUEST) -> None:
+    probe = rig.next()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, Resynced(told_from))
+
+
+def good(rig: Rig) -> bool:
+    return any(sample.quality is Quality.GOOD for sample in rig.samples)
+
+
+def test_before_an_extra_reply_the_values_of_a_read_wait_for_nothing() -> None:
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    read(rig)
+    assert good(rig)
+
+
+def test_after_it_they_wait_for_a_resync_and_have_the_time_of_their_reply() -> None:
+    rig = doubtful()
+    read(rig)
+    at = rig.now
+    assert not good(rig)
+    prove(rig)
+    assert good(rig)
+    assert {sample.time for sample in rig.samples} == {int(at * SECOND)}
+
+
+def test_the_other_devices_of_the_line_are_doubtful_too() -> None:
+    rig = doubtful(link_device(), link_device(station=2))
+    for device in rig.devices:
+        read(rig, device)
+        assert not good(rig)
+        prove(rig)
+        assert good(rig)
+
+
+def test_a_resync_that_another_reply_may_answer_is_followed_by_silence() -> None:
+    rig = doubtful()
+    read(rig)
+    prove(rig, told_from=1)
+    assert not good(rig)
+    settle = rig.next()
+    assert isinstance(settle, Settle)
+    assert settle.gap == rig.device.settled_after
+    rig.conclude(settle, Settled(None))
+    assert good(rig)
+
+
+def test_a_minute_after_the_last_extra_reply_the_resync_is_enough() -> None:
+    rig = doubtful()
+    rig.now += SHOWN
+    read(rig)
+    assert not good(rig)
+    prove(rig, told_from=1)
+    assert good(rig)
+
+
+def test_where_the_resync_may_be_answered_by_the_own_reply_it_is_sent_again_in_silence() -> None:
+    rig = doubtful()
+    read(rig)
+    prove(rig, told_from=0)
+    settle = rig.next()
+    assert isinstance(settle, Settle)
+    assert settle.gap == rig.device.longest_reply
+    rig.conclude(settle, Settled(None))
+    assert not good(rig)
+    prove(rig, told_from=0)
+    assert good(rig)
+
+
+@pytest.mark.parametrize("when", ["before its resync", "during it", "in the silence after it"])
+def test_an_extra_reply_ends_a_read_that_waits(when: str) -> None:
+    rig = doubtful()
+    job = read(rig)
+    if when == "before its resync":
+        hear(rig)
+    probe = rig.next()
+    assert isinstance(probe, Probe)
+    if when == "during it":
+        hear(rig)
+    rig.conclude(probe, Resynced(1))
+    if when == "in the silence after it":
+        settle = rig.next()
+        hear(rig)
+        rig.conclude(settle, Settled(None))  # type: ignore[arg-type]
+    again = read(rig)
+    assert not good(rig)
+    assert again.block is job.block
+
+
+def test_the_own_reply_that_arrives_at_once_after_another_one_ends_the_read() -> None:
+    """Both come in one piece: the extra one is known before the read is concluded."""
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    job = rig.transacted()
+    assert isinstance(job, Poll)
+    hear(rig)
+    rig.conclude(job, [7] * job.span.size, replace(REPLIED, extra=1))
+    prove(rig)
+    assert not good(rig)
+
+
+@pytest.mark.parametrize("result", [SILENCE, REFUSED])
+def test_a_resync_without_its_reply_proves_nothing(result: Exception) -> None:
+    rig = doubtful()
+    read(rig)
+    probe = rig.next()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, result)  # type: ignore[arg-type]
+    assert not good(rig)
+    assert isinstance(rig.next(), Settle)
+
+
+def test_a_wire_that_is_never_quiet_proves_nothing() -> None:
+    rig = doubtful()
+    read(rig)
+    prove(rig, told_from=1)
+    settle = rig.next()
+    assert isinstance(settle, Settle)
+    rig.conclude(settle, Settled(None, quiet=False))
+    assert not good(rig)
+    assert rig.device.state is State.ONLINE
+
+
+def test_reads_without_a_proof_turn_the_tags_bad_after_the_retries() -> None:
+    rig = doubtful(link_device(retries=1))
+    for _ in range(2):
+        read(rig)
+        hear(rig)
+        prove(rig)
+    assert {(one.quality, one.detail) for one in rig.samples} == {(Quality.BAD, UNPROVEN)}
+
+
+@pytest.mark.parametrize("job", [Probe, Settle])
+def test_a_port_that_is_lost_meanwhile_makes_no_value(job: type) -> None:
+    rig = doubtful()
+    read(rig)
+    if job is Settle:
+        prove(rig, told_from=1)
+    current = rig.next()
+    assert isinstance(current, Probe | Settle)
+    assert type(current) is job
+    rig.conclude(current, LOST)
+    rig.note(rig.engine.lost(LOST, rig.now, rig.time))
+    rig.note(rig.engine.opened(rig.now))
+    assert not good(rig)
+    read(rig)
+    prove(rig)
+    assert good(rig)
+
+
+def test_the_line_is_trusted_after_ten_minutes_without_an_extra_reply() -> None:
+    rig = doubtful()
+    rig.now += WARY_FOR - 1
+    read(rig)
+    assert not good(rig)
+    prove(rig)
+    assert rig.device.is_doubtful
+    rig.now += 2
+    read(rig)
+    assert good(rig)
+    assert not rig.device.is_doubtful
+
+
+def test_the_forecast_has_the_load_with_proofs() -> None:
+    one = forecast("line", [link_device()], WIRE)
+    assert one.load_proven > 1.5 * one.load
+
+
+def test_numbered_replies_need_no_proof() -> None:
+    rig = Rig(tcp_device())
+    one = forecast("line", [rig.device], WIRE)
+    assert one.load_proven == one.load
+    assert not rig.device.is_doubtful
