@@ -143,8 +143,9 @@ class Engine:
             entry = in_flight.open.pop(job)
             if good:  # units are the only good result of a poll
                 units = cast("Sequence[int]", result)
-                if (shapes := job.device.shapes) is not None and shapes.quiet == WARY:
-                    self._next_job.hold(HeldRead(entry, units, now, time, traffic.extra > 0))
+                shapes, extra = job.device.shapes, traffic.extra > 0
+                if shapes is not None and (extra or shapes.quiet == WARY):
+                    self._next_job.hold(HeldRead(entry, units, now, time, extra))
                 else:
                     self._polls.read(entry, units, now, time)
             else:
@@ -271,6 +272,8 @@ class Engine:
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
+        if (held := self._in_flight.held) is not None:
+            held.doubt()  # they may be a part of its own reply
         if listens(self.devices):
             self.record.count(len(data) * self.wire.character, 0.0)  # of another master
         else:

@@ -68,6 +68,7 @@ class Echo:
         "_pending",
         "_setting",
         "absent_at",
+        "before",
         "found",
         "strip",
     )
@@ -86,9 +87,10 @@ class Echo:
         self.absent_at = -NEVER  # when a reply came without an echo last
         self._pending = b""  # the part of the echo that must still arrive
         self._early = b""  # bytes that arrived before the echo
+        self.before = 0  # their number, once it has arrived
 
     def sent(self, data: bytes) -> None:
-        self._pending, self._early = data, b""
+        self._pending, self._early, self.before = data, b"", 0
 
     @property
     def absent_by_evidence(self) -> bool:
@@ -112,7 +114,7 @@ class Echo:
         if place < 0:
             self._early = self._early[-KEPT - len(self._pending) :]
             return b""
-        rest = self._early[place + len(self._pending) :]
+        rest, self.before = self._early[place + len(self._pending) :], place
         self._pending = self._early = b""
         return rest
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Settled, Traffic
 from gateway.errors import Busy, DeviceError, Evidence, Garbled, LineDown
-from gateway.line.channel import NEVER, Channel
+from gateway.line.channel import NEVER, SHORTEST_REPLY, Channel
 from gateway.line.timed_out import LateReply, verdict
 from gateway.protocols.driver import Codec, EndedByGap
 
@@ -288,6 +288,8 @@ class Transaction:
     def _answer(self, request: _Request, frame: Any, answer: Any) -> None:
         """Ends a request that was answered, and learns of an echo."""
         echo = self._channel.echo
+        if echo.before >= SHORTEST_REPLY:  # they are no frame any more
+            self.traffic.extra += 1
         if not echo.strip and (echo.found is not False or request.data in self._heard):
             echo.learn(request.data, self._heard, request.reply)
         if answer is True:  # an acknowledgement; of these, some repeat the request

@@ -151,6 +151,37 @@ def test_the_own_reply_that_arrives_at_once_after_another_one_ends_the_read() ->
     assert not good(rig)
 
 
+def test_bytes_before_the_resync_is_sent_end_the_read() -> None:
+    """They may be the begin of its own reply: the rest arrives while the resync is sent."""
+    rig = doubtful()
+    read(rig)
+    probe = rig.next()
+    assert isinstance(probe, Probe)
+    rig.note(rig.engine.received(b"\x02", rig.now, rig.time))
+    rig.conclude(probe, Resynced(EVERY_REQUEST))
+    assert not good(rig)
+
+
+def test_an_extra_reply_that_is_no_frame_any_more_ends_the_read() -> None:
+    rig = doubtful()
+    read(rig)
+    probe = rig.next()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, Resynced(EVERY_REQUEST), replace(REPLIED, extra=1))
+    assert not good(rig)
+
+
+def test_a_read_with_an_extra_reply_that_is_no_frame_is_the_first_evidence() -> None:
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    job = rig.transacted()
+    assert isinstance(job, Poll)
+    rig.conclude(job, [7] * job.span.size, replace(REPLIED, extra=1))
+    assert rig.device.is_doubtful
+    prove(rig)
+    assert not good(rig)
+
+
 @pytest.mark.parametrize("result", [SILENCE, REFUSED])
 def test_a_resync_without_its_reply_proves_nothing(result: Exception) -> None:
     rig = doubtful()

@@ -308,6 +308,17 @@ async def test_an_echo_is_no_acknowledgement(added: bytes) -> None:
         await driver.write(talk, Span("holding", 5, 1), [42])
 
 
+@pytest.mark.parametrize(("before", "extra"), [(b"", 0), (b"\x00", 0), (b"\x06151", 1)])
+@on_virtual_time
+async def test_more_than_noise_before_an_echo_is_an_extra_reply(before: bytes, extra: int) -> None:
+    """The own reply to the request before, while the next one is sent: no frame is left of it."""
+    port = EchoingPort()
+    port.added = before
+    talk = opened(port, echo=True)
+    await read(talk)
+    assert talk.traffic.extra == extra
+
+
 @on_virtual_time
 async def test_without_the_expected_echo_no_reply_counts() -> None:
     driver = ModbusRtu(station=1)

@@ -100,6 +100,8 @@ class NextJob:
         """
         device, now = read.poll.device, read.now
         health, shapes = device.health, device.shapes
+        if read.doubted:
+            self._results.answered_twice(device, now, read.time)
         health.left_outstanding(read.poll.job.span, now)
         probe = Probe(device, health.outstanding, health.next_probe_token())
         if shapes is not None:
@@ -158,6 +160,8 @@ class NextJob:
         self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         device = probe.device
+        if traffic.extra and (held := self._in_flight.held) is not None:
+            held.doubt()
         match result:
             case (
                 Resynced() | Refused()
