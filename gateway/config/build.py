@@ -96,7 +96,7 @@ class Builder:
             self.folder,
             self.state_folder,
             state_file,
-            [tag for line in lines for tag in line.tags],
+            lines,
             self._tags.recorded or self._sheets.recorded,
         )
         return Config(

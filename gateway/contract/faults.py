@@ -49,6 +49,9 @@ def _of_parts(documents: Documents) -> Iterator[str]:
             f"{file} is a damaged file that was moved aside, and what it held is forgotten: remove "
             "or rename it when you know"
         )
+    for door, document in below("doors/", documents):
+        if document["trouble"]:
+            yield f"door {door} to line {document['line']} is closed: {document['trouble']}"
     for part, document in below("files/", documents):
         if document["trouble"]:
             yield f"{part} not saved: {document['trouble']}; a restart forgets the last changes"

@@ -189,8 +189,11 @@ class North(Protocol):
         """Publishes the document at `@gateway/<name>/<path>`. Never blocks: the publishing thread
         calls `make`, and only for the last of several."""
 
-    def write_own(self, tag: Tag, value: Value, by: str, within: float) -> Awaitable[WriteResult]:
-        """Writes for a part, named `by`. After `within` seconds nothing is sent any more. Raises
+    def write_own(
+        self, tag: Tag, value: Value, by: str, within: float, *, repeated: bool = True
+    ) -> Awaitable[WriteResult]:
+        """Writes for a part, named `by`. After `within` seconds nothing is sent any more.
+        `repeated`: the audit tells only an end that differs from the last one. Raises
         `GatewayError`."""
 
     async def write(

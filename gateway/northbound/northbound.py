@@ -168,9 +168,11 @@ class Northbound:
         """Publishes a document of a part. Never blocks: the publishing thread makes it."""
         self._publisher.latest(self.keys.status(path), make)
 
-    async def write_own(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
+    async def write_own(
+        self, tag: Tag, value: Value, by: str, within: float, *, repeated: bool = True
+    ) -> WriteResult:
         """Writes for a part named `by`, as `OwnWrites.write`."""
-        return await self._incoming.own_writes.write(tag, value, by, within)
+        return await self._incoming.own_writes.write(tag, value, by, within, repeated=repeated)
 
     @property
     def is_ready(self) -> bool:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gateway.plant.part import Kind
 
 PARTS = (
-    *("history", "audit", "state", "serving", "transfers", "alarms"),
+    *("history", "audit", "state", "serving", "sharing", "transfers", "alarms"),
     *("certificates", "damaged_files", "web"),
 )
 

@@ -21,6 +21,7 @@ from gateway.errors import GatewayError
 from gateway.line.line import Line
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
+from gateway.plant.any_address import AnyAddress
 from gateway.plant.build import OpenPort, line_of, opener
 from gateway.plant.doors import Doors
 from gateway.plant.expected import Adjust, Expected
@@ -82,7 +83,10 @@ class Plant:
         self._open_line, self._seeds = open_line, itertools.count()
         self._expected = Expected(lambda: self.config)
         self._on_demand = OnDemand(self._places.get, self.sample)
-        self._requests = WritePath(self._places, self._tags, self.doors.stores, wall)
+        self.any_address = AnyAddress(self._places, wall)
+        self._requests = WritePath(
+            self._places, self._tags, self.any_address, self.doors.stores, wall
+        )
         for line in config.lines:
             if not line.serve:
                 self.add_line(line)
@@ -287,7 +291,7 @@ class Plant:
         return await self._requests.control(device, command, argument, within)
 
     async def peek(self, device: str, text: str) -> Peeked:
-        return await self._requests.peek(device, text)
+        return await self.any_address.peek(device, text)
 
     def dialling(self, device: str) -> float:
         return self._requests.dialling(device)

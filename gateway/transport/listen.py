@@ -48,19 +48,23 @@ class Listener:
         except (OSError, UnicodeError, OverflowError) as error:
             raise line_down(self._name, error) from error
 
-    async def serve(self, connect: Callable[[], Connected]) -> None:
-        """Accepts connections until cancelled. `connect` makes the receiver of each."""
+    async def serve(self, connect: Callable[[str], Connected | None]) -> None:
+        """Accepts connections until cancelled. `connect` makes the receiver of each, from the
+        address of the other side; None: it is closed at once."""
         if self._socket is None:
             raise LineDown(f"{self._name}: not open")
         loop = asyncio.get_running_loop()
         while True:
             try:
-                connection, _ = await loop.sock_accept(self._socket)
+                connection, address = await loop.sock_accept(self._socket)
             except OSError as error:
                 raise line_down(self._name, error) from error
-            await self._accept(connection, connect)
+            if (receiver := connect(address[0])) is None:
+                connection.close()
+            else:
+                await self._accept(connection, receiver)
 
-    async def _accept(self, connection: socket.socket, connect: Callable[[], Connected]) -> None:
+    async def _accept(self, connection: socket.socket, receiver: Connected) -> None:
         loop = asyncio.get_running_loop()
         if len(self._ports) >= MOST_CONNECTIONS:
             idlest = min(
@@ -73,7 +77,7 @@ class Listener:
                 return
             log.warning("connection closed", port=self._name, why=f"{why}: the idlest goes")
             await idlest.close()
-        accepted = _Accepted(self._name, connect(), self._ports)
+        accepted = _Accepted(self._name, receiver, self._ports)
         try:
             configure(connection)
             await loop.connect_accepted_socket(lambda: accepted, connection)

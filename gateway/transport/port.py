@@ -54,6 +54,24 @@ class Rfc2217Address:
     port: int
 
 
+def is_loopback(host: str) -> bool:
+    """Returns True if no other machine can reach the address."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+Networks = tuple[IPv4Network | IPv6Network, ...]
+
+
+def allows(networks: Networks, address: str) -> bool:
+    """Returns True if the address is in one of the networks, or there are none."""
+    found = ip_address(address.partition("%")[0])
+    found = getattr(found, "ipv4_mapped", None) or found
+    return not networks or any(found in one for one in networks)
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceServer:
     """Which device server a line waits for at its port `listen://…`, and what it sends by itself.
@@ -63,7 +81,7 @@ class DeviceServer:
 
     registration: bytes = b""
     heartbeat: bytes = b""
-    networks: tuple[IPv4Network | IPv6Network, ...] = ()
+    networks: Networks = ()
 
     @property
     def words(self) -> tuple[bytes, ...]:
@@ -71,9 +89,7 @@ class DeviceServer:
         return tuple(word for word in (self.registration, self.heartbeat) if word)
 
     def allows(self, address: str) -> bool:
-        found = ip_address(address.partition("%")[0])
-        found = getattr(found, "ipv4_mapped", None) or found
-        return not self.networks or any(found in one for one in self.networks)
+        return allows(self.networks, address)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,6 @@
-// npm's modbus-serial as an ASCII master: node modbus_serial_client.js DEVICE STATION
+// npm's modbus-serial as a master: node modbus_serial_client.js DEVICE STATION [tcp]
+//
+// ASCII on a serial port; with `tcp` DEVICE is a port number of this machine.
 //
 // Writes registers and coils of a slave of ours, reads them back, asks for what it does not have
 // (holding 9000). Prints what it read as one line of JSON.
@@ -6,9 +8,13 @@
 
 const Modbus = require("modbus-serial");
 
-async function main(device, station) {
+async function main(device, station, network) {
     const master = new Modbus();
-    await master.connectAsciiSerial(device, { baudRate: 19200 });
+    if (network) {
+        await master.connectTCP("127.0.0.1", { port: Number(device) });
+    } else {
+        await master.connectAsciiSerial(device, { baudRate: 19200 });
+    }
     master.setID(Number(station));
     master.setTimeout(2000);
     await master.writeRegisters(100, [1, 2, 65535]);

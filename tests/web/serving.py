@@ -139,7 +139,9 @@ class PlainNorth:
     def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
         raise AssertionError("the web publishes nothing")
 
-    async def write_own(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
+    async def write_own(
+        self, tag: Tag, value: Value, by: str, within: float, *, repeated: bool = True
+    ) -> WriteResult:
         raise AssertionError("the web writes for its clients only")
 
     async def order(

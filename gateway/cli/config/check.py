@@ -19,6 +19,7 @@ from gateway.config.messages import dotted
 from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.parts.history.store.place import trouble
+from gateway.parts.sharing.plan import door_plans, door_warnings
 from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
 from gateway.parts.web import exposure
 from gateway.planning.planner import describe
@@ -52,17 +53,13 @@ def check(
         lines = forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for part in _without_polls(loaded):
+    for part in _special(loaded, lines):
         out.print(part)
-    by_name = {line.name: line for line in lines}
-    calling = [line for line in loaded.lines if line.modem is not None or line.close_after]
-    for line, forecast in ((line, by_name.get(line.name)) for line in calling):
-        out.print(Text(modem_plan(line, forecast)))
-        warnings += [] if forecast is None else modem_warnings(line, forecast)
-    if loaded.transfers:
-        out.print(_transfers(transfer_forecasts(loaded, lines)))
     for note in _notes(loaded):
         err.print(f"note: {note}")
+    warnings += door_warnings(loaded, lines)
+    by_name = {line.name: line for line in loaded.lines}
+    warnings += [text for one in lines for text in modem_warnings(by_name[one.name], one)]
     for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
         err.print(f"warning: {warning}")
     if unwritable := list(_unwritable(loaded)):
@@ -72,6 +69,18 @@ def check(
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _special(config: Config, lines: Sequence[LineForecast]) -> Iterator[RenderableType]:
+    """Yields what is special: lines without polls, modems, transfers, doors."""
+    yield from _without_polls(config)
+    forecasts = {line.name: line for line in lines}
+    for line in config.lines:
+        if line.modem is not None or line.close_after:
+            yield Text(modem_plan(line, forecasts.get(line.name)))
+    if config.transfers:
+        yield _transfers(transfer_forecasts(config, lines))
+    yield from map(Text, door_plans(config, lines))
 
 
 def _without_polls(config: Config) -> Iterator[RenderableType]:

@@ -14,6 +14,7 @@ from pydantic import create_model
 
 from gateway.config.messages import Mistakes, Path
 from gateway.config.settings.model import FileSection
+from gateway.config.settings.records import LineConfig
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.zenoh_records import existing_file
 from gateway.tags import Tag
@@ -38,8 +39,12 @@ class Place:
     folder: FilePath  # of the file
     state_folder: FilePath | None  # for the files that the gateway writes
     state_file: FilePath | None
-    tags: Sequence[Tag]
+    lines: Sequence[LineConfig]
     recorded: Path | None  # the first tag with `history: true`
+
+    @property
+    def tags(self) -> Sequence[Tag]:
+        return [tag for line in self.lines for tag in line.tags]
 
     def written(self, name: FilePath) -> FilePath:
         """Returns the path of a file that the gateway writes."""

@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Collection, Iterator, Mapping
 from functools import cache
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -98,10 +98,14 @@ def _adapter(known: Protocol) -> TypeAdapter[Any]:
 
 def _known(kind: type[BaseModel], place: Path) -> Collection[str]:
     """Returns the settings at a place inside a section."""
-    for chunk in place:
-        inner = _inner(kind.model_fields[str(chunk)].annotation)
+    chunks = iter(place)
+    for chunk in chunks:
+        annotation = kind.model_fields[str(chunk)].annotation
+        inner = _inner(annotation)
         if inner is None:
             return ()
+        if get_origin(annotation) is dict:
+            next(chunks, None)  # the name of one of several sections
         kind = inner
     return settings_of(kind)
 

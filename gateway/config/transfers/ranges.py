@@ -21,7 +21,7 @@ from gateway.values import Kind
 
 MOST = 64  # words or bits of a row, as in a table of LINK
 READ, WRITTEN = "ranges/", "ranges/to/"  # begin the names of the tags
-_KINDS = {Unit.BIT: Kind.BOOL, Unit.WORD: Kind.UINT16, Unit.DWORD: Kind.UINT32}
+UNIT_KINDS = {Unit.BIT: Kind.BOOL, Unit.WORD: Kind.UINT16, Unit.DWORD: Kind.UINT32}
 
 
 def is_range(text: str) -> bool:
@@ -128,7 +128,7 @@ def _section(device: DeviceSettings, spelt: str, other: Tag | None) -> dict[str,
         what = "a station of the gateway" if device.served is not None else "no PLC with registers"
         raise ConfigError(f"{device.name} is {what}: name a tag, as device/tag")
     area, numbers = addresses(device.driver, spelt, MOST)
-    kind = _KINDS[device.driver.areas[area].unit]
+    kind = UNIT_KINDS[device.driver.areas[area].unit]
     if kind is Kind.UINT16 and other is not None and other.layout.type.kind is Kind.INT16:
         kind = Kind.INT16
     first, dots, _ = spelt.partition("..")

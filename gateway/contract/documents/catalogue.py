@@ -52,6 +52,7 @@ _STATE: dict[str, Any] = {  # by path
     "files/{file}": state.FileDocument,
     "damaged": state.DamagedDocument,
     "transfers/{number}": state.TransferDocument,
+    "doors/{door}": state.DoorDocument,
     "clock": state.ClockDocument,
     "parts/{part}": state.PartDocument,
     "certificates/{setting}": state.CertificateDocument,

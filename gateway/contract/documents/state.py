@@ -282,6 +282,33 @@ class TransferDocument(_Ends):
     unclear: int
 
 
+class GuestDocument(TypedDict):
+    """A program that is connected to a door; `since`: seconds ago."""
+
+    address: str
+    since: float
+    requests: int
+    writes: int
+    refused: int
+    unanswered: int
+
+
+class DoorDocument(TypedDict):
+    """A door of a line for other programs.
+
+    `share`: of the wire time of the last minute, by all doors of the line.
+    """
+
+    line: str
+    listen: str
+    protocol: str
+    trouble: str
+    most: float
+    share: float
+    turned_away: int
+    programs: list[GuestDocument]
+
+
 class ServedKey(TypedDict):
     key: str
     verbs: list[str]

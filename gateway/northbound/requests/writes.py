@@ -154,16 +154,18 @@ class Writes:
 
 @dataclass(eq=False)
 class OwnWrites:
-    """Writes of the gateway itself, for its transfers: the rules and audit of a client's write."""
+    """Writes of the parts: the rules and audit of a client's write."""
 
     _keys: Keys
     _plant: Plant
     _audit: Audit
 
-    async def write(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
+    async def write(
+        self, tag: Tag, value: Value, by: str, within: float, *, repeated: bool = True
+    ) -> WriteResult:
         """Returns when the device has acknowledged. After `within` seconds nothing is sent.
 
-        Raises `GatewayError`.
+        `repeated`: it may come each second for years. Raises `GatewayError`.
         """
         started, now = time.monotonic(), asyncio.get_running_loop().time()
         dialling = self._plant.dialling(tag.device)
@@ -181,7 +183,8 @@ class OwnWrites:
             raise
         finally:
             took, key = time.monotonic() - started, self._keys.value(tag.key)
-            self._audit.of_transfer(WriteOutcome(key, value, ended, time.time_ns(), took, by))
+            tell = self._audit.of_transfer if repeated else self._audit
+            tell(WriteOutcome(key, value, ended, time.time_ns(), took, by))
         return ended
 
 

@@ -1,10 +1,11 @@
 """Warnings about endpoints that other machines can reach, made before the session opens."""
 
-import ipaddress
 import json
 import re
 
 import zenoh
+
+from gateway.transport.port import is_loopback
 
 _MAY_HOLD_SECRET = re.compile(r"passw|usrpwd|_base64", re.IGNORECASE)
 _LOCAL_PROTOCOLS = ("unixsock-stream",)
@@ -90,7 +91,4 @@ def _is_local(endpoint: str) -> bool:
     if protocol in _LOCAL_PROTOCOLS:
         return True
     host = address.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    return is_loopback(host)

@@ -124,7 +124,7 @@ class ServedLine:
                 self._begin()
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(self._watch())
-                    tasks.create_task(listener.serve(lambda: Conversation(self, network=True)))
+                    tasks.create_task(listener.serve(lambda _: Conversation(self, network=True)))
             except* LineDown as lost:
                 raise LineDown(str(lost.exceptions[0])) from lost
             finally:

@@ -1,13 +1,13 @@
 """The section `web` of the file."""
 
 from fnmatch import fnmatchcase
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress
+from gateway.transport.port import is_loopback
 
 
 class WebTlsSection(Section):
@@ -50,10 +50,7 @@ class WebSection(Section):
     @property
     def is_local(self) -> bool:
         """True if other machines cannot reach the address."""
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_loopback(self.host)
 
 
 def _place(settings: WebSection | None, place: Place) -> WebSection | None:

@@ -6,8 +6,7 @@ from typing import NamedTuple, Protocol
 
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.served.echo import Echo
-from gateway.stations.served.registers import Registers
-from gateway.stations.store import Written
+from gateway.stations.store import Store, Written
 
 # Fewer bytes behind a request are noise of the wire; more are the beginning of the next request.
 NOISE = 2
@@ -52,7 +51,7 @@ class Answering(NamedTuple):
     """One station: its settings and its data."""
 
     driver: AnyDriver
-    registers: Registers
+    registers: Store
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

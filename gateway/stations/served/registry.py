@@ -12,18 +12,22 @@ MakeAnswerer = Callable[[Stations, Wire], Answerer]
 
 
 class _Served(NamedTuple):
-    """`make` returns the machine for the stations of a line; they share the `common` settings."""
+    """`make` returns the machine for the stations of a line; they share the `common` settings.
+
+    Protocols of one family carry the same requests in other frames.
+    """
 
     make: MakeAnswerer
+    family: str
     common: Sequence[str] = ()
 
 
 _SERVED: dict[str, _Served] = {
-    "modbus-tcp": _Served(modbus_wire.tcp),
-    "modbus-rtu": _Served(modbus_wire.rtu),
-    "modbus-ascii": _Served(modbus_wire.ascii_line),
-    "vigor": _Served(vigor),
-    "computer-link": _Served(computer_link, ("frame_format", "sum_check")),
+    "modbus-tcp": _Served(modbus_wire.tcp, "modbus"),
+    "modbus-rtu": _Served(modbus_wire.rtu, "modbus"),
+    "modbus-ascii": _Served(modbus_wire.ascii_line, "modbus"),
+    "vigor": _Served(vigor, "vigor"),
+    "computer-link": _Served(computer_link, "computer-link", ("frame_format", "sum_check")),
 }
 
 
@@ -33,6 +37,13 @@ def can_serve(protocol: str) -> bool:
 
 def served_protocols() -> list[str]:
     return list(_SERVED)
+
+
+def relatives(protocol: str) -> list[str]:
+    """Returns the protocols in whose frames a station of this protocol can be asked."""
+    if not can_serve(protocol):
+        return []
+    return [name for name, one in _SERVED.items() if one.family == _SERVED[protocol].family]
 
 
 def common_settings(protocol: str) -> Sequence[str]:

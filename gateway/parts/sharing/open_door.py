@@ -1,0 +1,112 @@
+"""A door while the gateway runs: its port, and the programs that are connected."""
+
+import asyncio
+import random
+from collections.abc import Coroutine, Mapping
+from typing import Any, TypeVar
+
+import structlog
+
+from gateway.config import Config
+from gateway.contract.documents.state import DoorDocument
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.errors import LineDown
+from gateway.line.send_permit import Duty
+from gateway.parts.sharing.guest import Guest
+from gateway.parts.sharing.settings import Door
+from gateway.parts.sharing.turns import Turns
+from gateway.stations.served.answering import Answerer, Answering, Wire
+from gateway.stations.served.echo import Echo
+from gateway.stations.served.registry import answerer
+from gateway.stations.store import Store
+from gateway.transport.listen import Listener
+from gateway.transport.port import allows
+
+log = structlog.get_logger("gateway.line")
+REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
+T = TypeVar("T")
+
+
+class OpenDoor:
+    """The task of one door. The listener bounds the number of its programs."""
+
+    def __init__(
+        self, settings: Door, turns: Turns, duty: Duty, tasks: asyncio.TaskGroup, config: Config
+    ) -> None:
+        self.settings = settings
+        self.turns = turns
+        self.guests: set[Guest] = set()
+        self.devices: Mapping[int, DeviceSettings] = settings.stations(config)  # by station
+        self._wire = next(one.wire for one in config.lines if one.name == settings.line)
+        self._duty = duty
+        self._tasks = tasks
+        self._trouble = ""
+        self._turned_away = 0
+
+    @property
+    def numbered(self) -> bool:
+        """A reply has the number of its request, so it is never taken for another one."""
+        return self.settings.protocol == "modbus-tcp"
+
+    async def run(self) -> None:
+        """Serves until cancelled."""
+        pause, jitter = REOPEN_FIRST, random.Random(self.settings.name)  # noqa: S311  (no secret)
+        while True:
+            listener = Listener(self.settings.where)
+            try:
+                await listener.open()
+                log.info("door open", door=self.settings.name, line=self.settings.line)
+                self._trouble, pause = "", REOPEN_FIRST
+                await listener.serve(self.connect)
+            except LineDown as error:
+                if self._trouble != str(error):
+                    log.warning("door closed", door=self.settings.name, why=str(error))
+                self._trouble = str(error)
+            finally:
+                await listener.close()
+            await asyncio.sleep(pause * jitter.uniform(0.8, 1.2))
+            pause = min(2 * pause, REOPEN_LONGEST)
+
+    def connect(self, address: str) -> Guest | None:
+        if not allows(self.settings.networks, address):
+            self._turned_away += 1
+            log.debug("turned away", door=self.settings.name, address=address)
+            return None
+        return Guest(self, address)
+
+    def start(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        return self._tasks.create_task(work)
+
+    def why_not(self, now: float) -> str:
+        """Returns the reason to answer nothing now; empty: none."""
+        return self._duty.why_not(now, now)
+
+    def machine(self, stores: Mapping[int, Store]) -> Answerer:
+        """Returns an answering machine over these stores, by station number."""
+        stations = {
+            number: Answering(self.devices[number].driver, store)
+            for number, store in stores.items()
+        }
+        wire = Wire(character=self._wire.character, echo=Echo(told=False))
+        return answerer(self.settings.protocol, stations, wire)
+
+    def take_over(self, config: Config) -> None:
+        """Takes over a changed file. Programs connect again if their devices are others now."""
+        devices = self.settings.stations(config)
+        if devices != self.devices:
+            self.devices = devices
+            for guest in [*self.guests]:
+                guest.leave()
+
+    def document(self, now: float) -> DoorDocument:
+        settings = self.settings
+        return {
+            "line": settings.line,
+            "listen": f"{settings.where.host}:{settings.where.port}",
+            "protocol": settings.protocol,
+            "trouble": self._trouble,
+            "most": settings.most,
+            "share": round(self.turns.share(now), 4),
+            "turned_away": self._turned_away,
+            "programs": [guest.document(now) for guest in self.guests],
+        }

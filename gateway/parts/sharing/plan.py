@@ -1,0 +1,55 @@
+"""The part of `check` about doors: who can ask which devices, and what it does to the line."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from gateway.config import Config
+from gateway.engine.forecast import LineForecast
+from gateway.parts.sharing.settings import Door, Sharing
+from gateway.protocols.driver import Address, AnyDriver, Span
+
+
+def door_plans(config: Config, lines: Sequence[LineForecast]) -> Iterator[str]:
+    """Yields a text for each door of the file."""
+    loads = {line.name: line.load for line in lines}
+    for door in _doors(config):
+        devices = {one.name: one.driver for one in door.stations(config).values()}
+        written = "; ".join(_written(door, devices)) or "nothing"
+        stations = ", ".join(f"{name} ({one.station})" for name, one in devices.items())
+        load = loads.get(door.line, 0.0)
+        yield (
+            f"door {door.name}: programs at {door.where.host}:{door.where.port} ask {stations} "
+            f"by {door.protocol}, and may write {written}\n"
+            f"  they get at most {door.most:.0%} of line {door.line}: its load is then "
+            f"{load + door.most:.0%}"
+        )
+
+
+def door_warnings(config: Config, lines: Sequence[LineForecast]) -> list[str]:
+    """Returns a sentence for each line that cannot carry its polls and its doors."""
+    most: dict[str, float] = {}
+    for door in _doors(config):
+        most[door.line] = max(most.get(door.line, 0.0), door.most)
+    return [
+        f"line {line.name} is asked for {line.load + most[line.name]:.0%} of what it can carry "
+        "while programs use their share: its values are then older than above; write a smaller "
+        "`most`, or longer intervals"
+        for line in lines
+        if line.name in most and line.load <= 1 < line.load + most[line.name]
+    ]
+
+
+def _doors(config: Config) -> Sequence[Door]:
+    sharing = config.part(Sharing)
+    return () if sharing is None else sharing.doors
+
+
+def _written(door: Door, devices: Mapping[str, AnyDriver]) -> Iterator[str]:
+    for name, spans in door.writes.items():
+        if name in devices and spans:
+            yield f"{name} {', '.join(_spelt(devices[name], span) for span in spans)}"
+
+
+def _spelt(driver: AnyDriver, span: Span) -> str:
+    first = driver.spell(Address(span.area, span.start))
+    last = driver.spell(Address(span.area, span.start + span.size - 1))
+    return first if first == last else f"{first}..{last}"

@@ -1,0 +1,104 @@
+"""The requests of all doors of one line: one after another, in their share of the wire."""
+
+import asyncio
+import math
+from collections.abc import Mapping
+
+from gateway.contract.interfaces import North
+from gateway.engine.forecast import write_seconds
+from gateway.errors import BadValue, Busy, GatewayError, Refused
+from gateway.parts.sharing.settings import Door
+from gateway.parts.sharing.stores import Step
+from gateway.plant.any_address import AnyAddress
+from gateway.stations.store import Cell, Denied, Rejected, Why
+
+Outcome = Mapping[Cell, int] | Denied | Rejected
+_MINUTE = 60.0  # seconds over which the share is measured
+
+
+class Unanswered(Rejected):
+    """No reply of the device stands behind this one. `code`: as a Modbus gateway says it."""
+
+
+NOT_NOW, NO_REPLY = Unanswered("06"), Unanswered("0B")
+
+
+class Turns:
+    """One line. Belongs to the event loop.
+
+    The engine of the line plans each request as it plans those of other clients: with its
+    silences, its rules about late replies and its resyncs.
+    """
+
+    def __init__(self, any_address: AnyAddress, north: North) -> None:
+        self._any = any_address
+        self._north = north
+        self._turn = asyncio.Lock()
+        self._free_at = 0.0  # by the loop's clock: the share of the doors allows the next request
+        self._share, self._shared_at = 0.0, 0.0
+
+    async def carry_out(self, step: Step, door: Door, by: str, within: float) -> Outcome:
+        """Returns what the device did. After `within` seconds no request is sent any more."""
+        loop = asyncio.get_running_loop()
+        ends = loop.time() + within
+        try:
+            async with asyncio.timeout(within):
+                await self._turn.acquire()
+        except TimeoutError:
+            return NOT_NOW
+        try:
+            if self._free_at > ends:
+                return NOT_NOW
+            await asyncio.sleep(self._free_at - loop.time())
+            left = ends - loop.time()
+            return await (self._write if step.writes else self._read)(step, door, by, left)
+        except Refused as error:
+            return Rejected(error.code)
+        except BadValue:
+            return Denied(Why.NO_TAG)
+        except Busy:
+            return NOT_NOW
+        except GatewayError:
+            return NO_REPLY
+        finally:
+            self._turn.release()
+
+    async def _read(self, step: Step, door: Door, _by: str, within: float) -> Outcome:
+        found = dict[Cell, int]()
+        for run in step.runs():
+            _, device = self._any.place(step.device)
+            cost = device.driver.cost(run)
+            self._spend(0.0 if cost is None else device.seconds(cost), door.most)
+            units = await self._any.read(step.device, run, within)
+            found |= {(run.area, run.start + ahead): unit for ahead, unit in enumerate(units)}
+        return found
+
+    async def _write(self, step: Step, door: Door, by: str, within: float) -> Outcome:
+        if not all(door.may_write(step.device, *cell) for cell in step.cells):
+            return Denied(Why.NOT_ACCEPTED)
+        runs = [*step.runs()]
+        tags = [self._any.target(step.device, run) for run in runs]  # before the first is sent
+        try:
+            for run, tag in zip(runs, tags, strict=True):
+                _, device = self._any.place(step.device)
+                value = tag.from_units(step.units(run))
+                if value is None:
+                    return Denied(Why.BAD)
+                self._spend(write_seconds(device, tag), door.most)
+                done = await self._north.write_own(tag, value, by, within, repeated=False)
+                if done.value != value:  # the device took another one
+                    return Denied(Why.BAD)
+        finally:
+            self._any.refresh(step.device, runs)
+        return {}
+
+    def _spend(self, seconds: float, most: float) -> None:
+        """Notes the wire time of a request: the next one waits until the share allows it."""
+        now = asyncio.get_running_loop().time()
+        self._share = self.share(now) + seconds / _MINUTE
+        self._shared_at = now
+        self._free_at = max(self._free_at, now) + seconds / most
+
+    def share(self, now: float) -> float:
+        """Returns the share of the wire time in the last minute."""
+        return self._share * math.exp((self._shared_at - now) / _MINUTE)

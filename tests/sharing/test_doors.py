@@ -1,0 +1,347 @@
+"""Doors of a simulated plant, on a virtual clock: programs without a socket."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from struct import pack
+from typing import Any, NoReturn
+
+import pytest
+
+from gateway.config import built
+from gateway.config.messages import ConfigErrors
+from gateway.contract.keys import Keys
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.writes import OwnWrites
+from gateway.parts.sharing.guest import MOST_WAITING, Guest
+from gateway.parts.sharing.open_door import OpenDoor
+from gateway.parts.sharing.plan import door_plans, door_warnings
+from gateway.parts.sharing.settings import Sharing
+from gateway.parts.sharing.stores import Step
+from gateway.parts.sharing.turns import Turns
+from gateway.parts.transfers.forecast import forecasts
+from gateway.plant.plant import Plant
+from gateway.protocols.driver import Span
+from gateway.protocols.modbus.frame import Frame
+from gateway.protocols.modbus.rtu import encode
+from gateway.tags import Tag, WriteResult
+from gateway.values import Value
+from tests.serving.easy_link import frame as vigor_frame
+from tests.serving.test_computer_link import request as link_request
+from tests.sim.virtual import now, on_virtual_time
+
+LINES: dict[str, Any] = {
+    "hall": {
+        "port": "simulator",
+        "baudrate": 19200,
+        "devices": {
+            "press": {
+                "protocol": "modbus-rtu",
+                "station": 1,
+                "tags": {"speed": {"address": "holding:0", "every": "100ms"}},
+            }
+        },
+    },
+    "ovens": {
+        "port": "simulator",
+        "devices": {
+            "oven": {"protocol": "vigor", "station": 3, "tags": {"t": {"address": "D100"}}}
+        },
+    },
+    "link": {
+        "port": "simulator",
+        "devices": {
+            "mixer": {
+                "protocol": "computer-link",
+                "station": 5,
+                "tags": {"t": {"address": "D0100"}},
+            }
+        },
+    },
+}
+WRITES = {"press": ["holding:10..19", "coil:0..7"]}
+
+
+def door(line: str, protocol: str, **settings: Any) -> dict[str, Any]:
+    return {"line": line, "listen": "127.0.0.1:1502", "protocol": protocol, **settings}
+
+
+@dataclass(eq=False)
+class Program:
+    """One connection of a door, and what arrives there."""
+
+    door: OpenDoor
+    replies: list[tuple[float, bytes]] = field(default_factory=list)
+    closed: bool = False
+    guest: Guest = field(init=False)
+
+    def __post_init__(self) -> None:
+        guest = self.door.connect("127.0.0.1")
+        assert guest is not None
+        self.guest = guest
+        guest.opened(self)
+
+    def write(self, data: bytes) -> None:
+        self.replies.append((now(), data))
+
+    async def close(self) -> None:
+        self.closed = True
+
+    async def ask(self, request: bytes, wait: float = 3.0) -> bytes:
+        """Returns what arrives in so many seconds."""
+        self.replies.clear()
+        self.guest.received(request)
+        await asyncio.sleep(wait)
+        return b"".join(data for _, data in self.replies)
+
+
+class _End(Exception):
+    """The end of a test: it ends the lines and programs."""
+
+
+def _end() -> NoReturn:
+    raise _End
+
+
+@dataclass(eq=False)
+class Hall:
+    """The plant, and its only door."""
+
+    plant: Plant
+    door: OpenDoor
+    outcomes: list[bytes]
+
+
+@asynccontextmanager
+async def opened(settings: dict[str, Any], lines: Any = LINES) -> AsyncIterator[Hall]:
+    config = built({"lines": lines, "share": {"doors": {"laptop": settings}}})
+    plant = Plant(config, lambda: int(now() * 1e9))
+    outcomes: list[bytes] = []
+    own = OwnWrites(Keys("plant", "demo"), plant, Audit(outcomes.append))
+
+    class North:
+        async def write_own(
+            self, tag: Tag, value: Value, by: str, within: float, *, repeated: bool = True
+        ) -> WriteResult:
+            return await own.write(tag, value, by, within, repeated=repeated)
+
+    sharing = config.part(Sharing)
+    assert sharing is not None
+    north: Any = North()
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            [one] = sharing.doors
+            made = OpenDoor(one, Turns(plant.any_address, north), plant.duty, tasks, config)
+            for line in plant.lines:
+                tasks.create_task(line.run())
+            await asyncio.sleep(2)
+            yield Hall(plant, made, outcomes)
+            _end()
+    except* _End:
+        pass
+
+
+def rtu(pdu: str, station: int = 1) -> bytes:
+    return encode(Frame(station, bytes.fromhex(pdu)))
+
+
+def tcp(pdu: str, number: int = 7, station: int = 1) -> bytes:
+    data = bytes.fromhex(pdu)
+    return pack(">HHHB", number, 0, len(data) + 1, station) + data
+
+
+@on_virtual_time
+async def test_a_program_reads_and_writes_by_rtu() -> None:
+    async with opened(door("hall", "modbus-rtu", writes=WRITES)) as hall:
+        program = Program(hall.door)
+        assert await program.ask(rtu("06 000a 1234")) == rtu("06 000a 1234")
+        assert await program.ask(rtu("10 000b 0002 04 0001 0002")) == rtu("10 000b 0002")
+        assert await program.ask(rtu("03 000a 0003")) == rtu("03 06 1234 0001 0002")
+        assert await program.ask(rtu("05 0003 ff00")) == rtu("05 0003 ff00")
+        assert await program.ask(rtu("01 0000 0008")) == rtu("01 01 08")
+        assert len(hall.outcomes) == 3
+        assert b'"by":"door laptop, 127.0.0.1"' in hall.outcomes[0]
+
+
+@on_virtual_time
+async def test_nothing_is_written_but_what_the_file_names() -> None:
+    async with opened(door("hall", "modbus-rtu", writes=WRITES)) as hall:
+        program = Program(hall.door)
+        for pdu in ("06 0009 0001", "06 0014 0001", "10 0013 0002 04 0001 0002", "05 0008 ff00"):
+            function = int(pdu[:2], 16)
+            assert await program.ask(rtu(pdu)) == rtu(f"{function | 0x80:02x} 02")
+        assert hall.outcomes == []
+        [told] = hall.door.document(now())["programs"]
+        assert (told["requests"], told["writes"], told["refused"]) == (4, 0, 4)
+
+
+@on_virtual_time
+async def test_a_door_without_writes_only_reads() -> None:
+    async with opened(door("hall", "modbus-tcp")) as hall:
+        program = Program(hall.door)
+        assert await program.ask(tcp("06 000a 0001")) == tcp("86 02")
+        assert await program.ask(tcp("03 000a 0001")) == tcp("03 02 0000")
+
+
+@on_virtual_time
+async def test_requests_behind_one_another_are_answered_in_their_order() -> None:
+    async with opened(door("hall", "modbus-tcp", writes=WRITES, most="99%")) as hall:
+        program = Program(hall.door)
+        asked = [tcp("03 000a 0001", 1), tcp("06 000a 0005", 2), tcp("03 000a 0001", 3)]
+        answer = await program.ask(b"".join(asked[:2]) + asked[2][:5])
+        answer += await program.ask(asked[2][5:])
+        told = [tcp("03 02 0000", 1), tcp("06 000a 0005", 2), tcp("03 02 0005", 3)]
+        assert answer == b"".join(told)
+        assert await program.ask(tcp("03 000a 0001", 4, station=9)) == tcp("83 0a", 4, station=9)
+
+
+@on_virtual_time
+async def test_programs_of_vigor_and_computer_link_plcs() -> None:
+    async with opened(door("ovens", "vigor", writes={"oven": ["D10..D19"]})) as hall:
+        program = Program(hall.door)
+        written = await program.ask(vigor_frame(3, "61", "1C14043412CDAB"))
+        assert written[1:7] == b"036100"
+        assert b"3412CDAB" in await program.ask(vigor_frame(3, "51", "1C1404"))
+        refused = await program.ask(vigor_frame(3, "61", "1C28043412CDAB"))  # D20
+        assert refused[1:7] == b"036128"
+    async with opened(door("link", "computer-link", writes={"mixer": ["D0010"]})) as hall:
+        program = Program(hall.door)
+        assert (await program.ask(link_request("05FFWW0D0010011234"))).startswith(b"\x0605FF")
+        assert b"1234" in await program.ask(link_request("05FFWR0D001001"))
+        assert (await program.ask(link_request("05FFRS0"))).startswith(b"\x1505FF18")
+
+
+@on_virtual_time
+async def test_a_silent_station_is_silent_at_a_serial_door_and_0b_at_a_network_door() -> None:
+    lines = {
+        "hall": {
+            **LINES["hall"],
+            "devices": {
+                **LINES["hall"]["devices"],
+                "gone": {
+                    "protocol": "modbus-rtu",
+                    "station": 2,
+                    "enabled": False,
+                    "tags": {"t": {"address": "holding:0"}},
+                },
+            },
+        }
+    }
+    async with opened(door("hall", "modbus-tcp"), lines) as hall:
+        assert await Program(hall.door).ask(tcp("03 0000 0001", station=2)) == tcp(
+            "83 0a", station=2
+        )
+        hall.plant.move(["press"], hall.plant.lines[0])
+        assert await Program(hall.door).ask(tcp("03 0000 0001")) == tcp("83 0b")
+    async with opened(door("hall", "modbus-rtu"), lines) as hall:
+        hall.plant.move(["press"], hall.plant.lines[0])
+        program = Program(hall.door)
+        assert await program.ask(rtu("03 0000 0001")) == b""
+        [told] = hall.door.document(now())["programs"]
+        assert told["unanswered"] == 1
+
+
+@on_virtual_time
+async def test_a_reply_is_dropped_when_the_program_has_gone_on() -> None:
+    async with opened(door("hall", "modbus-rtu", most="1%", reply_within="10s")) as hall:
+        program = Program(hall.door)
+        first = await program.ask(rtu("03 000a 0001"), wait=0.2)  # its share is used up now
+        assert first == rtu("03 02 0000")
+        assert await program.ask(rtu("03 000a 0002"), wait=0.2) == b""
+        assert await program.ask(rtu("03 000a 0003"), wait=8.0) == rtu("03 06" + "00" * 6)
+
+
+@on_virtual_time
+async def test_a_reply_is_dropped_when_it_is_late() -> None:
+    async with opened(door("hall", "modbus-rtu", most="1%")) as hall:
+        program = Program(hall.door)
+        await program.ask(rtu("03 000a 007d"), wait=1.0)
+        assert await program.ask(rtu("03 000a 0001"), wait=30.0) == b""
+        assert await program.ask(rtu("03 000a 0001")) == rtu("03 02 0000")
+
+
+@on_virtual_time
+async def test_programs_get_their_share_and_no_more() -> None:
+    async with opened(door("hall", "modbus-tcp", most="30%")) as hall:
+        programs = [Program(hall.door) for _ in range(4)]
+        line = hall.plant.lines[0]
+        [device] = line.engine.devices
+
+        async def flood(program: Program) -> None:
+            while True:
+                await program.ask(tcp("03 0064 007d"), wait=0.01)
+
+        floods = [asyncio.create_task(flood(one)) for one in programs]
+        await asyncio.sleep(40)
+        for one in floods:
+            one.cancel()
+        [poll] = line.engine.polls(device)
+        assert poll.reads.at is not None
+        assert now() - poll.reads.at < 0.3
+        # The share is measured over a minute.
+        assert 0.12 < hall.door.document(now())["share"] < 0.31
+
+
+@on_virtual_time
+async def test_a_program_that_pours_is_disconnected() -> None:
+    async with opened(door("hall", "modbus-tcp")) as hall:
+        program = Program(hall.door)
+        program.guest.received(tcp("03 0000 0001") * (MOST_WAITING // 12 + 1))
+        await asyncio.sleep(1)
+        assert program.closed
+        assert hall.door.document(now())["programs"] == []
+
+
+@on_virtual_time
+async def test_only_the_networks_of_the_file_connect() -> None:
+    allowed = door("hall", "modbus-tcp", listen="0.0.0.0:1502", allow=["10.1.0.0/16"])
+    async with opened(allowed) as hall:
+        assert hall.door.connect("10.2.0.1") is None
+        assert hall.door.connect("10.1.0.1") is not None
+        assert hall.door.document(now())["turned_away"] == 1
+
+
+MISTAKES = {
+    "no line hill: did you mean hall": door("hill", "modbus-tcp"),
+    "can be asked by modbus-ascii, modbus-rtu or modbus-tcp": door("hall", "vigor"),
+    "other machines can reach 0.0.0.0": door("hall", "modbus-tcp", listen="0.0.0.0:1502"),
+    "no device oven: use press": door("hall", "modbus-tcp", writes={"oven": ["D0"]}),
+    "1% to 99%": door("hall", "modbus-tcp", most="100%"),
+    "at most 10s": door("hall", "modbus-tcp", reply_within="11s"),
+    "D0": door("hall", "modbus-tcp", writes={"press": ["D0"]}),
+}
+
+
+@pytest.mark.parametrize("what", MISTAKES)
+def test_a_mistake_is_said(what: str) -> None:
+    with pytest.raises(ConfigErrors) as found:
+        built({"lines": LINES, "share": {"doors": {"laptop": MISTAKES[what]}}})
+    [message] = found.value.messages
+    assert what in message
+
+
+def test_a_door_needs_a_line_that_sends() -> None:
+    served = {"port": "/dev/ttyS98", "serve": True, "devices": LINES["ovens"]["devices"]}
+    with pytest.raises(ConfigErrors, match="another master owns its wire"):
+        built({"lines": {"ovens": served}, "share": {"doors": {"one": door("ovens", "vigor")}}})
+
+
+def test_check_says_who_may_ask_what() -> None:
+    settings = door("hall", "modbus-tcp", writes=WRITES, most="90%")
+    config = built({"lines": LINES, "share": {"doors": {"laptop": settings}}})
+    lines = forecasts(config)
+    [text] = door_plans(config, lines)
+    assert "press (1) by modbus-tcp" in text
+    assert "press holding:10..holding:19, coil:0..coil:7" in text
+    [warning] = door_warnings(config, lines)
+    assert "line hall is asked for" in warning
+
+
+def test_the_neighbours_of_a_step() -> None:
+    cells = {("D", 5): 1, ("D", 4): 2, ("M", 6): 3, ("D", 7): 4}
+    step = Step("press", True, cells)
+    runs = [*step.runs()]
+    assert runs == [Span("D", 4, 2), Span("D", 7, 1), Span("M", 6, 1)]
+    assert step.units(runs[0]) == [2, 1]
+    assert [*Step("press", False).runs()] == []
