@@ -83,10 +83,8 @@ class Plant:
         self._open_line, self._seeds = open_line, itertools.count()
         self._expected = Expected(lambda: self.config)
         self._on_demand = OnDemand(self._places.get, self.sample)
-        self.any_address = AnyAddress(self._places, wall)
-        self._requests = WritePath(
-            self._places, self._tags, self.any_address, self.doors.stores, wall
-        )
+        any_address = AnyAddress(self._places, wall)
+        self._requests = WritePath(self._places, self._tags, any_address, self.doors.stores, wall)
         for line in config.lines:
             if not line.serve:
                 self.add_line(line)
@@ -292,6 +290,11 @@ class Plant:
 
     async def peek(self, device: str, text: str) -> Peeked:
         return await self.any_address.peek(device, text)
+
+    @property
+    def any_address(self) -> AnyAddress:
+        """Reads and writes what no tag names."""
+        return self._requests.any_address
 
     def dialling(self, device: str) -> float:
         return self._requests.dialling(device)

@@ -31,7 +31,7 @@ class WritePath:
 
     _places: Mapping[str, tuple[Line, Device]]
     _tags: Mapping[str, Tag]
-    _any: AnyAddress
+    any_address: AnyAddress
     _stores: Sequence[Store]
     _wall: Callable[[], int]
 
@@ -78,7 +78,7 @@ class WritePath:
     def _is_target(self, tag: Tag, place: tuple[Line, Device] | None) -> bool:
         settings = None if place is None else place[1].settings
         return settings is not None and (
-            tag in settings.targets or self._any.is_target(tag, settings.driver)
+            tag in settings.targets or self.any_address.is_target(tag, settings.driver)
         )
 
     def _place(self, device: str) -> tuple[Line, Device]:

@@ -73,14 +73,17 @@ class Outstanding:
     sent: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     # Their spans, but those of resyncs; None: a request that may have had any shape.
     spans: set[Span | None] = field(default_factory=set)
+    either: int = 0  # of any shape: the reply to the request, or to the resync that went with it
 
     def add(self, span: Span | None, now: float) -> None:
         self.sent.append(now)
         self.spans.add(span)
+        self.either += span is None
 
     def clear(self) -> None:
         self.sent.clear()
         self.spans.clear()
+        self.either = 0
 
 
 @dataclass(slots=True, eq=False)

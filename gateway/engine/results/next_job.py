@@ -167,7 +167,8 @@ class NextJob:
                 Resynced() | Refused()
             ):  # an error reply counts too, but may belong to an older request
                 told_from = result.told_from if isinstance(result, Resynced) else 0
-                outstanding = self._results.outstanding_requests(device)
+                if outstanding := self._results.outstanding_requests(device):
+                    outstanding += device.health.unanswered.either
                 inherited = told_from < EVERY_REQUEST and (self.inherits or device.health.inherits)
                 if not probe.again and (outstanding > told_from or inherited):
                     if told_from and not inherited and device.may_be_proven:

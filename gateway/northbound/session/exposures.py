@@ -1,11 +1,10 @@
 """Warnings about endpoints that other machines can reach, made before the session opens."""
 
+import ipaddress
 import json
 import re
 
 import zenoh
-
-from gateway.transport.port import is_loopback
 
 _MAY_HOLD_SECRET = re.compile(r"passw|usrpwd|_base64", re.IGNORECASE)
 _LOCAL_PROTOCOLS = ("unixsock-stream",)
@@ -91,4 +90,7 @@ def _is_local(endpoint: str) -> bool:
     if protocol in _LOCAL_PROTOCOLS:
         return True
     host = address.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-    return is_loopback(host)
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -27,6 +27,7 @@ from gateway.transport.port import ModemAddress, Networks, TcpAddress, is_loopba
 _PERCENT = re.compile(r"([1-9][0-9]?) ?%\Z")
 _MOST_WRITTEN = 65_536  # addresses of one range
 LONGEST_WAIT = 10.0  # seconds
+USUAL_SHARE = 0.3  # of the wire time
 
 
 def _percent(value: object) -> float:
@@ -49,10 +50,10 @@ class DoorSection(Section):
     """The addresses that may connect, such as [10.1.0.0/16]."""
     writes: dict[str, list[Text]] = {}
     """By device: the addresses that may be written, such as {press: [D0..D99]}; left out: none."""
-    most: Annotated[float, Parsed(_percent, {"type": "string", "pattern": "^[1-9][0-9]? ?%$"})] = (
-        0.3
-    )
-    """The share of the wire time that the programs get."""
+    most: Annotated[
+        float | None, Parsed(_percent, {"type": "string", "pattern": "^[1-9][0-9]? ?%$"})
+    ] = None
+    """The share of the wire time that the programs get; left out: 30%."""
     reply_within: Interval = 1.0
     """Requests that wait longer get no reply: the program no longer waits for one."""
 
@@ -142,7 +143,7 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
         section.protocol,
         section.allow or (),
         _writes(section, devices, path, place),
-        section.most,
+        USUAL_SHARE if section.most is None else section.most,
         section.reply_within,
     )
 
