@@ -194,6 +194,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
         "station": 2,
         "tags": {"a": {"address": "D1"}},
     }
+    door = {"line": "hall", "listen": f"127.0.0.1:{free_port()}", "protocol": "vigor"}
     config = write_config(
         folder / "config.yaml",
         endpoint,
@@ -201,6 +202,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
         history={"path": "history.db"},
         alarms={"path": "alarms.json", "devices": True, "lines": True},
         gateway={"name": "demo", "standby": "hall", "audit": "audit.jsonl"},
+        share={"doors": {"laptop": door}},
         transfers=[{"from": "mixer/speed", "to": "mixer/trim", "every": "1s", "stale": "9s"}],
     )
     with station("pty", own, stations=(1, 2)) as plc:

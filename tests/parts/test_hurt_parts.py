@@ -25,7 +25,8 @@ class Plant:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.endpoint, self.port, self.served = free_endpoint(), free_port(), free_port()
+        self.endpoint, self.port = free_endpoint(), free_port()
+        self.served, self.door = free_port(), free_port()
         self.changes = 0
         (folder / "tokens").write_text("ana:a-token-that-is-long-enough\n")
         (folder / "tokens").chmod(0o600)
@@ -54,6 +55,7 @@ class Plant:
                 "devices": {"hmi": {"protocol": "modbus-tcp", "tags": served}},
             },
         }
+        door = {"line": "hall", "listen": f"127.0.0.1:{self.door}", "protocol": "vigor"}
         return write_config(
             self.folder / "plant.yaml",
             self.endpoint,
@@ -64,6 +66,7 @@ class Plant:
             alarms={"path": "alarms.json"},
             templates_from="templates.yaml",
             defaults={"every": "100ms", "history": True},
+            share={"doors": {"laptop": door}},
             transfers=[{"from": "mixer/level", "to": "mixer/copy", "every": "1h"}],
         )
 
@@ -142,6 +145,7 @@ POINTS = {
     "audit": ("run", "documents"),
     "state": ("run",),
     "serving": ("run", "seen", "documents"),
+    "sharing": ("run", "documents", "take_over"),
     "transfers": ("run", "publish", "documents", "take_over"),
     "alarms": ("run", "seen", "documents", "retag", "take_over"),
     "damaged_files": ("run", "documents"),
