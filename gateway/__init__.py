@@ -1,3 +1,3 @@
 """A gateway between PLCs on serial lines and Eclipse Zenoh."""
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
