@@ -4,7 +4,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Mapping
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import typer
 from rich.console import Group, RenderableType
@@ -23,9 +23,9 @@ from gateway.contract.faults import (
     warnings,
 )
 from gateway.contract.line_faults import span
-from gateway.tags.tag import NotReal
 
 HOUR = "now(-1h)"
+_NOT_REAL = ("simulated", "replayed")  # as `NotReal` of tags: `health` shall not import them
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
 _STYLES |= {"carried": "green", "waiting": "yellow", "stale": "red", "refused": "red"}
 _STYLES |= {"unclear": "red", "connected": "green", "dialling": "yellow", "doubtful": "yellow"}
@@ -109,7 +109,7 @@ def _standby(documents: Documents) -> str:
 
 def _lines(documents: Documents) -> Table:
     status = documents["status"]
-    origins = {name: word for word in get_args(NotReal) for name in status.get(word, ())}
+    origins = {name: word for word in _NOT_REAL for name in status.get(word, ())}
     table = _table("line", "state", "open for", "load", "expected", "requests/s", "slowest write")
     for name, document in below("lines/", documents):
         measured, expected = document["measured"], document["expected"]
