@@ -40,11 +40,11 @@ def is_silent(engine: Engine, now: float) -> bool | None:
     """True if no device of an open line replies, or has replied for `BACK`: that is one cause, the
     line's. None: it is not known. A line with one device is never silent: its device is."""
     asked = [device for device in engine.devices if device.health.is_probed]
-    replies = any(one.health.online and now - one.record.falls.ended >= BACK for one in asked)
-    if len(asked) < 2 or replies:
+    back = [one for one in asked if one.health.online and now - one.record.falls.ended < BACK]
+    if len(asked) < 2 or any(one.health.state is State.ONLINE and one not in back for one in asked):
         return False
-    states = {device.health.state for device in asked}
-    return True if State.OFFLINE in states and State.STARTING not in states else None
+    offline = sum(one.health.state is State.OFFLINE for one in asked)
+    return True if offline and offline + len(back) == len(asked) else None
 
 
 def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> DeviceDocument:

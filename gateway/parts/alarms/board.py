@@ -171,8 +171,9 @@ class Alarms:
             log_change(entry, event)
         for sink in self._sinks:
             sink(entry, event)
+        if event in (Event.RAISED, Event.FOLDED):
+            self.tally.note(entry, event, asyncio.get_running_loop().time())
         if event is Event.RAISED:
-            self.tally.note_raised(asyncio.get_running_loop().time())
             for part in self.parts(entry):
                 self._fold(part)
 

@@ -36,6 +36,7 @@ class Entry:
     look: Callable[[], Reading] | None = None  # only for lines and devices
     reading: Reading = _UNKNOWN  # what it returned last
     parent: str = ""  # the alarm of which it may be a part
+    raised_at: float = -math.inf  # by the loop's clock
     own_from: float = -math.inf  # it is no part from then on, by the loop's clock
     released_at: float = math.inf  # the end of its shelving, by the loop's clock
     by: Acknowledgement | None = None  # who put it back; None: the time did

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import structlog
 
 from gateway.parts.alarms.entry import Entry
-from gateway.parts.alarms.machine import State
+from gateway.parts.alarms.machine import Event, State
 from gateway.tags.timestamps import rfc3339
 
 log = structlog.get_logger("gateway")
@@ -62,8 +62,13 @@ class Tally:
 
     # -- floods --
 
-    def note_raised(self, now: float) -> None:
-        self._raised.append(now)
+    def note(self, entry: Entry, event: Event, now: float) -> None:
+        """Counts what is raised. What is folded into another alarm since then counts no longer."""
+        if event is Event.RAISED:
+            entry.raised_at = now
+            self._raised.append(now)
+        elif event is Event.FOLDED and entry.raised_at in self._raised:
+            self._raised.remove(entry.raised_at)
 
     def look(self, now: float, time: int) -> None:
         """Begins and ends a flood. `time`: ns since 1970."""

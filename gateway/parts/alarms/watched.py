@@ -16,6 +16,9 @@ from gateway.tags import AlarmRule, Level, Priority
 # Seconds that a line is down before it is an alarm: an adapter that is plugged again, or a device
 # server that starts again, is back earlier.
 LINE_DELAY = 3.0
+# Seconds that a device is silent until it is an alarm although no device of its line replies: they
+# fall silent one after the other, and then the line is the alarm.
+LINE_KNOWN = 15.0
 LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
 _KINDS = {
     Level.DOWN: ("lines", Priority.CRITICAL),
@@ -46,7 +49,7 @@ def conditions(
         for device in line.engine.devices:
             rule = AlarmRule({Level.OFFLINE: True}, text=f"{device.name} does not reply")
             parent = key if device.health.is_probed else ""
-            found[device.name] = Condition(rule, partial(_device, device), parent)
+            found[device.name] = Condition(rule, partial(_device, line, device, now), parent)
     return found
 
 
@@ -90,10 +93,15 @@ def _why_silent(line: Line, now: float) -> str:
     return "; ".join(sentence.removeprefix(f"line {name}: ") for sentence in told)
 
 
-def _device(device: Device) -> Reading:
-    """Not known while the line is down, or before the first probes have ended."""
+def _device(line: Line, device: Device, now: Callable[[], float]) -> Reading:
+    """Not known while the line is down, before the first probes have ended, and for some seconds
+    while no device of its line replies."""
     state = device.health.state
     if state is State.STARTING:
         return Reading(None)
-    is_offline = state is State.OFFLINE
-    return Reading(is_offline, device.diagnosis() if is_offline else "")
+    if state is not State.OFFLINE:
+        return Reading(False)
+    fell_lately = (device.record.falls.lasts(now()) or 0.0) < LINE_KNOWN
+    if fell_lately and is_silent(line.engine, now()) is not False:
+        return Reading(None, "it is not known yet whether it is the device or the line")
+    return Reading(True, device.diagnosis())
