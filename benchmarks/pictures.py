@@ -26,6 +26,7 @@ from tests.zenoh_peer import free_endpoint
 
 SIZES = {"phone": (390, 844), "laptop": (1366, 768), "wall": (1920, 1080)}
 TREND = "trend?span=300&tags=oven/temperature,mixer/level"
+SCHEMES = ("light", "dark")
 VIEWS = {
     **{name: name for name in ("overview", "tags", "alarms", "lines")},
     "trend": TREND,
@@ -160,19 +161,20 @@ def files(folder: Path, ports: Ports) -> Iterator[tuple[str, Path, int]]:
     yield "large", path, port
 
 
-async def taken(tab: Tab, name: str, port: int, into: Path) -> None:
+async def taken(tab: Tab, name: str, port: int, arguments: argparse.Namespace) -> None:
     for view, address in VIEWS.items():
         if name == "large" and view in ("trend", "search"):
             address = {"trend": "trend?span=300&tags=d0-0/t0", "search": "tags?find=t42"}[view]
-        for size, (width, height) in SIZES.items():
-            for scheme in ("light", "dark"):
+        for size in arguments.sizes:
+            width, height = SIZES[size]
+            for scheme in arguments.schemes:
                 await tab.open("about:blank")  # the same address would not be loaded again
                 await tab.look(width, height, dark=scheme == "dark")
                 await tab.open(f"http://127.0.0.1:{port}/#{address}")
                 await tab.until(READY.get(view, READY["overview"]))
                 wide = await tab.value("document.documentElement.scrollWidth")
                 assert wide <= width, f"{name} {view} is {wide} wide on a {size}"
-                await tab.screenshot(into / f"{name}-{view}-{size}-{scheme}.png")
+                await tab.screenshot(arguments.into / f"{name}-{view}-{size}-{scheme}.png")
 
 
 LIVE = 'document.body?.className === ""'
@@ -195,7 +197,7 @@ async def look(situations: list[tuple[str, Path, int]], arguments: argparse.Name
     with tempfile.TemporaryDirectory() as profile:
         async with browser(arguments.chromium, Path(profile)) as tab:
             for name, _, port in situations:
-                await taken(tab, name, port, arguments.into)
+                await taken(tab, name, port, arguments)
             assert tab.errors == []
 
 
@@ -226,6 +228,8 @@ def main() -> None:
     parser.add_argument("--docs", action="store_true", help="copy some to docs/")
     parser.add_argument("--chromium", default="chromium")
     parser.add_argument("--after", type=float, default=75.0, help="seconds that the gateways run")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
+    parser.add_argument("--schemes", nargs="+", choices=SCHEMES, default=SCHEMES)
     arguments = parser.parse_args()
     os.nice(5)
     asyncio.run(run(arguments))

@@ -95,7 +95,7 @@ TINY = [
         [r"^the lines take [\d.]+% of a processor", r"^one scrape: [\d.]+ MB"],
     ),
 ]
-PICTURES = ["pictures", "--after", "0", "--into"]
+PICTURES = ["pictures", "--after", "0", "--sizes", "phone", "--schemes", "light", "--into"]
 BY_OTHER_TESTS = {"moves", "structure", "schemas"}  # test_structure.py, test_schemas.py
 PARTS_OF_OTHERS = {"__init__", "checkouts", "paced_wire", "plant_consumer", "words"}
 

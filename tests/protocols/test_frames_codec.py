@@ -5,7 +5,7 @@ import tracemalloc
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
@@ -103,8 +103,14 @@ def test_an_encoded_frame_is_decoded_in_any_pieces(
         assert found == [data]
 
 
+ONE_BYTE_TOO_LONG = Framing(
+    header="<02>", terminator="<02><03>", max_length=8, ends=("terminator", "gap")
+)
+
+
 @settings(max_examples=300)
 @given(framings(), noise, sizes, st.booleans())
+@example(ONE_BYTE_TOO_LONG, b"\x02" + bytes(9), [1], False)
 def test_any_bytes_in_any_pieces_give_the_same_frames_and_never_fail(
     framing: Framing, data: bytes, cuts: list[int], quiet: bool
 ) -> None:

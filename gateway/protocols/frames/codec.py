@@ -81,6 +81,8 @@ class FrameReader:
         framing, body = self._framing, len(self._header)
         if framing.ends_by_gap and (not self._mark or self._end_of_data(len(self._buffer)) is None):
             data = bytes(self._buffer[body:])
+            if len(data) > self._longest:  # fewer bytes more than the terminator has
+                return self._endless(body + self._longest)
             self._buffer.clear()
             return self._data(data)
         damage = Garbled(
