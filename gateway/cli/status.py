@@ -90,6 +90,7 @@ def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Rendera
         Text(),
         *_calls(documents),
         *_transfers(documents),
+        *_doors(documents),
         _services(documents, outcomes),
     ]
     for heading, style, found in (
@@ -187,6 +188,19 @@ def _transfers(documents: Documents) -> list[RenderableType]:
             str(document["unclear"]),
         )
     return [table, Text()] if rows else []
+
+
+def _doors(documents: Documents) -> list[RenderableType]:
+    """Returns the table of the doors and the programs there; nothing without any."""
+    table = _table("door", "line", "share", "program", "for", "requests", "writes", "refused")
+    for name, document in below("doors/", documents):
+        door = (Text(name), Text(document["line"]), f"{_share(document['share'])} of the wire")
+        for program in document["programs"]:
+            counts = (str(program[one]) for one in ("requests", "writes", "refused"))
+            table.add_row(*door, Text(program["address"]), span(program["since"]), *counts)
+        if not document["programs"]:
+            table.add_row(*door, "-")
+    return [table, Text()] if table.rows else []
 
 
 def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Table:

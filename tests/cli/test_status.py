@@ -158,6 +158,18 @@ def test_transfers_of_a_silent_device_do_not_hide_it(healthy: dict[str, Any]) ->
     assert list(warnings(documents)) == ["transfer 1 waits for oven"]  # it is not enabled
 
 
+def test_the_programs_at_a_door_are_shown(healthy: dict[str, Any]) -> None:
+    program = {"address": "10.1.0.7", "since": 61.0, "requests": 12, "writes": 3, "refused": 1}
+    door = {"line": "hall", "trouble": "", "share": 0.12, "programs": [program]}
+    documents = changed(healthy, "doors/laptop", **door)
+    assert re.search(
+        r"laptop +hall +12 % of the wire +10\.1\.0\.7 +1 min +12 +3 +1", text_of(documents)
+    )
+    documents = changed(healthy, "doors/laptop", **{**door, "programs": [], "trouble": "in use"})
+    assert list(faults(documents)) == ["door laptop to line hall is closed: in use"]
+    assert "-" in text_of(documents)
+
+
 def test_the_calls_of_a_modem_are_shown(healthy: dict[str, Any]) -> None:
     documents = changed(healthy, "lines/hall", calls=calling()["calls"])
     assert list(faults(documents)) == []
