@@ -40,7 +40,7 @@ from gateway.engine.jobs.jobs import (
     Traffic,
     Transacted,
 )
-from gateway.engine.jobs.requests import MOST_WAITING
+from gateway.engine.jobs.requests import MOST_WAITING, Write
 from gateway.engine.results.unsolicited import REPLY_WITHIN
 from gateway.errors import (
     BadValue,
@@ -691,6 +691,21 @@ def test_a_result_that_the_job_cannot_have_is_raised(situation: str, result: Res
     job = setup(rig)
     with pytest.raises((BadValue, TypeError)):
         rig.conclude(job, result)
+
+
+@pytest.mark.parametrize(("told_from", "proven"), [(1, False), (2, True)])
+def test_an_unclear_write_counts_as_two_outstanding_requests(told_from: int, proven: bool) -> None:
+    """Its reply may still arrive, or that to the resync which went with it."""
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    rig.write("D0")
+    write = rig.next()
+    assert isinstance(write, Write)
+    rig.fail(write)
+    probe = rig.transacted()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, Resynced(told_from))
+    assert isinstance(rig.next(), Settle) is not proven
 
 
 # What comes from outside
