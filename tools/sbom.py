@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,12 @@ def main() -> None:
     tool = Path(sys.executable).with_name("cyclonedx-py")
     command: list[str | Path] = [tool, "environment", "--output-reproducible", sys.argv[1]]
     found = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
-    FILE.write_text(json.dumps(of_wheel(found), indent=1, ensure_ascii=False) + "\n", "utf-8")
+    text = json.dumps(of_wheel(found), indent=1, ensure_ascii=False) + "\n"
+    schema = import_module("cyclonedx.schema").SchemaVersion.V1_6
+    validator = import_module("cyclonedx.validation.json").JsonStrictValidator(schema)
+    if fault := validator.validate_str(text):
+        raise SystemExit(f"{FILE} would not be CycloneDX 1.6: {fault}")
+    FILE.write_text(text, "utf-8")
 
 
 def of_wheel(found: dict[str, Any]) -> dict[str, Any]:
