@@ -117,10 +117,9 @@ class SavedFile:
 
 
 def _sync(folder: Path) -> None:
-    """Makes a new name survive a power cut. Only POSIX opens a folder."""
-    if os.name == "posix":
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
+    """Makes a new name survive a power cut."""
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

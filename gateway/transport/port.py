@@ -33,7 +33,7 @@ class Port(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SerialPath:
-    """A local serial port: `/dev/ttyUSB0`, `COM3`."""
+    """A local serial port: `/dev/ttyUSB0`."""
 
     path: str
 
@@ -151,7 +151,7 @@ def parse_port(text: str) -> PortAddress:
         return TcpAddress(host, port) if scheme == "tcp" else Rfc2217Address(host, port)
     if _SCHEME.match(text) or not text.strip() or text != text.strip():
         raise ConfigError(
-            f"{text!r} is not a port: write a path such as /dev/ttyUSB0 or COM3, "
+            f"{text!r} is not a port: write a path such as /dev/ttyUSB0, "
             "tcp://host:port, rfc2217://host:port, listen://host:port, modem:/dev/ttyS0, or "
             "simulator"
         )

@@ -334,7 +334,7 @@ LINES = [
             "parity: even\ndevices: {mixer: {protocol: vigor}}"
         ),
         "3: lines.hall.port: 'udp://10.0.0.7:4001' is not a port: write a path such as "
-        "/dev/ttyUSB0 or COM3, tcp://host:port, rfc2217://host:port, listen://host:port, "
+        "/dev/ttyUSB0, tcp://host:port, rfc2217://host:port, listen://host:port, "
         "modem:/dev/ttyS0, or simulator",
         "4: lines.hall.baudrate: 1920 is no baud rate of serial ports; the nearest is 2400",
         "5: lines.hall.format: '7X1' is no character format: write data bits (7 or 8), parity "

@@ -2,7 +2,6 @@
 
 import socket
 import stat
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from gateway.errors import GatewayError
 from gateway.northbound.session.one_process import only_process
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such lock")
 OWN = "plant/@gateway/demo"
 
 

@@ -52,9 +52,7 @@ def new(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The YAML file to write.")] = Path(
         "plant.yaml"
     ),
-    port: Annotated[
-        str | None, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port ...")
-    ] = None,
+    port: Annotated[str | None, typer.Option(help="/dev/ttyUSB0, tcp://host:port ...")] = None,
     protocol: Annotated[
         str | None, typer.Option(help="as the file names it after `protocol:`")
     ] = None,

@@ -33,7 +33,7 @@ MOST = 1000  # addresses
 MARKED = 5.0  # seconds for which a change is marked
 
 PortOption = Annotated[
-    str | None, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")
+    str | None, typer.Option(help="/dev/ttyUSB0, tcp://host:port, rfc2217://...")
 ]
 ProtocolOption = Annotated[str | None, typer.Option(help="as the file names it after `protocol:`")]
 SettingOption = Annotated[

@@ -20,7 +20,7 @@ TimeoutOption = Annotated[str, typer.Option(help="the longest turnaround of a st
 
 
 def scan(
-    port: Annotated[str, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")],
+    port: Annotated[str, typer.Option(help="/dev/ttyUSB0, tcp://host:port, rfc2217://...")],
     protocol: Annotated[str, typer.Option(help="as the file names it after `protocol:`")],
     stations: Annotated[
         str | None, typer.Option(help="the stations, e.g. 1-31,40 (default: up to 31)")

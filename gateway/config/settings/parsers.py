@@ -4,7 +4,6 @@ Each takes a value of the file, of any type, and raises `ConfigError` with a cor
 """
 
 import math
-import os
 import re
 import unicodedata
 from collections.abc import Callable
@@ -212,7 +211,7 @@ def port(text: object) -> PortAddress:
     found = parse_port(text)
     if isinstance(found, SerialPath) and not is_name(found.path):
         raise ConfigError(f"{text!r} is no port: no file can have this name")
-    if isinstance(found, SerialPath) and os.name == "posix" and "/" not in text:
+    if isinstance(found, SerialPath) and "/" not in text:
         if _WINDOWS.match(text):
             raise ConfigError(f"{text} is a port of Windows: here it is a path like /dev/ttyUSB0")
         raise ConfigError(f"{text} is no port: did you mean /dev/{text}?")

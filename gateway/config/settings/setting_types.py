@@ -93,7 +93,6 @@ _PORT_SCHEMA = {
     r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
     "examples": [
         "/dev/ttyUSB0",
-        "COM3",
         "tcp://10.0.0.7:4001",
         "rfc2217://host:port",
         "listen://0.0.0.0:5020",

@@ -23,7 +23,7 @@ def closed_to_others(path: Path, called: str) -> None:
         mode = path.stat().st_mode
     except OSError as error:
         raise ConfigError(f"{called} {path}: {error.strerror}") from None
-    if os.name == "posix" and mode & (stat.S_IROTH | stat.S_IWOTH):
+    if mode & (stat.S_IROTH | stat.S_IWOTH):
         raise ConfigError(
             f"{called} {path} is open to every user of this machine: run chmod o-rwx {path}"
         )

@@ -1,8 +1,8 @@
 """Notices a second process of the same gateway, also without any network."""
 
+import fcntl
 import hashlib
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,10 +33,6 @@ def only_process(folder: Path | None, gateway: str, *endpoints: str) -> Iterator
 
 def _locked(path: Path, gateway: str) -> int | None:
     """Returns None where no lock is possible: claims on the network remain."""
-    if sys.platform == "win32":
-        return None
-    import fcntl
-
     try:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         file = os.open(path, flags, 0o600)

@@ -1,30 +1,14 @@
 """The lock on a history file, so that only one gateway writes it."""
 
-import errno
+import fcntl
 import os
 import stat
-import sys
 from contextlib import suppress
 from pathlib import Path
 
 import structlog
 
-if sys.platform == "win32":
-    import msvcrt
-
-    def _take(file: int) -> None:
-        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
-
-else:
-    import fcntl
-
-    def _take(file: int) -> None:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
-
-_TAKEN = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES)  # the last on Windows
 
 
 def locked(path: Path) -> int:
@@ -42,11 +26,11 @@ def locked(path: Path) -> int:
         message = f"the file cannot be opened ({lock_path}: {error.strerror})"
         raise OSError(error.errno, message) from None
     try:
-        _take(file)
-    except OSError as error:
-        if error.errno in _TAKEN:
-            os.close(file)
-            raise BlockingIOError(error.errno, "another gateway writes this file") from None
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(file)
+        raise BlockingIOError(error.errno, "another gateway writes this file") from None
+    except OSError:
         log.warning(
             "history lock unavailable", path=str(path), so="only one gateway may write this file"
         )
