@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 from gateway.errors import NoReply
 from gateway.protocols.driver import AnyDriver, Talk
 
+_MOST_BYTES = 4096  # that are no reply: several times the longest one
 T = TypeVar("T")
 
 
@@ -44,8 +45,10 @@ class _Talk:
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
         self._send(self._codec.encode(frame))
-        while data := self._receive():
+        bytes_left = _MOST_BYTES
+        while bytes_left > 0 and (data := self._receive()):
+            bytes_left -= len(data)
             for received in self._codec.feed(data):
                 if (answer := answers(received)) is not None:
                     return answer
-        raise NoReply("no reply")
+        raise NoReply("no reply" if bytes_left > 0 else "bytes without an end, and no reply")

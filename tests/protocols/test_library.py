@@ -87,6 +87,12 @@ def test_faults_are_those_of_the_driver() -> None:
         read(Wire(VigorStation(1, holes=[("D", 100)])))
 
 
+def test_noise_without_an_end_ends_the_transaction() -> None:
+    plc = Vigor(station=1)
+    with pytest.raises(NoReply, match="bytes without an end"):
+        exchange(plc, lambda talk: plc.read(talk, D100), lambda _: None, lambda: b"\xff")
+
+
 def test_a_resync_is_an_exchange_too() -> None:
     wire, plc = Wire(), Vigor(station=1)
     assert exchange(plc, lambda talk: plc.resync(talk, D100, 3), wire.send, wire.receive) > 0
