@@ -15,6 +15,7 @@ GatewayError
 ├── Offline              the device is offline; nothing has been sent
 │   └── WrongDevice      another device replies in its place; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
+│   ├── Lent             wait: another program has the port
 │   └── CallEnded        dial again later: the modem is there, the telephone call is not
 └── DeviceError          one device, one transaction
     ├── Took             the device limited the written value, and said so
@@ -89,6 +90,10 @@ class WrongDevice(Offline):
 
 class LineDown(GatewayError):
     """A port that cannot be opened or was lost."""
+
+
+class Lent(LineDown):
+    """A port that another program has for a while."""
 
 
 class CallEnded(LineDown):

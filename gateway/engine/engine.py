@@ -41,7 +41,7 @@ from gateway.engine.results.staleness import Staleness
 from gateway.engine.rules import LineState, rules_of
 from gateway.engine.schedule.in_flight import HeldRead, InFlight
 from gateway.engine.schedule.schedule import Schedule
-from gateway.errors import BadValue, Busy, LineDown, Superseded
+from gateway.errors import BadValue, Busy, Lent, LineDown, Superseded
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Reason, Tag
 
@@ -341,13 +341,14 @@ class Engine:
 
     def lost(self, error: LineDown, now: float, time: int) -> list[Effect]:
         """Turns every value bad, because the port was lost or could not be opened."""
-        why = str(error)
+        why, lent = str(error), isinstance(error, Lent)
         self._next_job.abandon(error, now)
         self.record.lose(why, now, was_open=self.is_open)
         for device in self.devices:
             device.restart(error)
             self._effects.online(device, False)
-            self._effects.bad(device.tags, Reason.LINE_DOWN, time, why)
+            reason = Reason.MAINTENANCE if lent else Reason.LINE_DOWN
+            self._effects.bad(device.tags, reason, time, why)
         return self._close(f": {why}")
 
     def stopped(self, now: float) -> list[Effect]:

@@ -7,7 +7,7 @@ back; the engine's effects go to the clients, the sample sink and the log.
 import asyncio
 import random
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -21,10 +21,12 @@ from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, Reques
 from gateway.engine.engine import Engine
 from gateway.engine.jobs.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
 from gateway.engine.jobs.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
-from gateway.errors import CallEnded, GatewayError, LineDown
+from gateway.errors import CallEnded, GatewayError, Lent, LineDown
+from gateway.line import loan
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Alarm, Channel, channels
+from gateway.line.loan import Loan, OpenPort, own
 from gateway.line.perform import perform
 from gateway.line.polling import RESULTS, perform_together
 from gateway.line.send_permit import Duty
@@ -52,7 +54,7 @@ class Line:
     def __init__(
         self,
         engine: Engine,
-        open_port: Callable[[Receiver], Awaitable[Port]],
+        open_port: OpenPort,
         sink: SampleSink,
         *,
         echo: bool | None = None,
@@ -61,7 +63,7 @@ class Line:
     ) -> None:
         """`echo`: the port receives its own bytes; None: not known. `wall`: ns since 1970."""
         self.engine = engine
-        self._open_port = open_port
+        self._open_port: OpenPort | Loan = open_port
         self._sink = sink
         self.wire_log = WireLog()
         duty = duty or Duty()
@@ -78,6 +80,10 @@ class Line:
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
     # Clients
+
+    @property
+    def name(self) -> str:
+        return self.engine.name
 
     @property
     def dialling(self) -> float:
@@ -155,11 +161,30 @@ class Line:
         waiting, self._waiting = self._waiting, None
         if waiting is not None:
             self.deliver(self.engine.change(waiting.changes, _now()))
-            if isinstance(self._open_port, Changeable):
-                self._open_port.change(waiting.devices)
+            if isinstance(opens := own(self._open_port), Changeable):
+                opens.change(waiting.devices)
             waiting.applied()
             if not waiting.ended.done():
                 waiting.ended.set_result(None)
+
+    # Its port for another program
+
+    async def lend(self, why: str, receiver: Receiver) -> Port:
+        """Closes the line, and opens its port for another program, until `take_back`. Values are
+        bad meanwhile, requests are refused. `why`: who has it. Raises `LineDown`."""
+        if isinstance(self._open_port, Loan):
+            raise LineDown("another program has the wire")
+        lent = self._open_port = Loan(self._open_port, why)
+        self.lost(Lent(why))
+        await lent.left.wait()
+        return await lent.opens(receiver)
+
+    def take_back(self) -> None:
+        """Has the line open its port again. What the program asked may still be answered."""
+        if isinstance(lent := self._open_port, Loan):
+            self._open_port = lent.opens
+            lent.over.set()
+            self.engine.inherits()
 
     # The receiver of the port
 
@@ -206,11 +231,11 @@ class Line:
         while True:
             served, answered = 0.0, False
             try:
-                why = await self._open_and_serve()
+                error = await self._open_and_serve()
                 if self.engine.is_open:
                     served = _now() - self.engine.record.since
                     answered = self.engine.was_answered
-                self.deliver(self.engine.lost(LineDown(why), _now(), self._wall()))
+                self.deliver(self.engine.lost(error, _now(), self._wall()))
                 self.tried.set()
             finally:
                 self.deliver(self.engine.stopped(_now()))
@@ -218,10 +243,10 @@ class Line:
                 await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST or answered:
                 pause = REOPEN_FIRST
-            await asyncio.sleep(pause * chance.uniform(0.8, 1.2))
+            await loan.pause(self._open_port, pause * chance.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
 
-    async def _open_and_serve(self) -> str:
+    async def _open_and_serve(self) -> LineDown:
         """Opens the port and serves it. Returns the reason of the end."""
         name, self._lost = self.engine.name, None
         try:
@@ -238,10 +263,10 @@ class Line:
         except LineDown as error:
             known = str(error) == self.engine.record.trouble
             (log.debug if known else log.warning)("line down", line=name, why=str(error))
-            return str(error)
+            return error
         except Exception as error:  # an error in one line must not end the others
             log.exception("line failed", line=name)
-            return f"internal error: {error!r}"
+            return LineDown(f"internal error: {error!r}")
         raise AssertionError("a port is served until it is lost")
 
     def begin(self, port: Port) -> Channel:

@@ -23,6 +23,7 @@ class Reason(StrEnum):
     GARBLED = "garbled"  # the device replies, but no reply can be decoded
     REFUSED = "refused"  # an error reply: the device does not have this address
     LINE_DOWN = "line-down"  # the port is closed
+    MAINTENANCE = "maintenance"  # another program has the wire
     OVERDUE = "overdue"  # the device replies, but the last read of this tag is too old
     DISABLED = "disabled"  # `enabled: false` in the file
     NOT_A_NUMBER = "not-a-number"  # a good read, but no value of the tag's type (NaN, bad BCD)

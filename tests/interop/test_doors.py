@@ -26,17 +26,18 @@ def config(folder: Path, port: Path, doors: dict[str, int]) -> tuple[Path, str]:
         "station": 1,
         "tags": {f"t{n}": {"address": f"holding:{7 * n}"} for n in range(30, 30 + POLLED)},
     }
-    share = {
+    share: dict[str, dict[str, Any]] = {
         protocol: {
             "line": "hall",
             "listen": f"127.0.0.1:{number}",
             "protocol": protocol,
-            "writes": {"press": ["holding:100..holding:163", "coil:16..coil:36"]},
             "most": "60%",
             "reply_within": "5s",
         }
         for protocol, number in doors.items()
     }
+    for door in (one for protocol, one in share.items() if protocol != "raw"):
+        door["writes"] = {"press": ["holding:100..holding:163", "coil:16..coil:36"]}
     hall = {"port": str(port), "baudrate": 19200, "format": "8N1", "devices": {"press": press}}
     own = {"name": "demo", "audit": str(folder / "audit.jsonl")}
     sections = {"gateway": own, "share": {"doors": share}}
@@ -46,8 +47,8 @@ def config(folder: Path, port: Path, doors: dict[str, int]) -> tuple[Path, str]:
 async def test_four_programs_use_the_line_between_its_polls(
     libmodbus: Path, modbus_serial: str, socat: str, tmp_path: Path
 ) -> None:
-    mbpoll, tcp, rtu = needs("mbpoll"), free_port(), free_port()
-    doors = {"modbus-tcp": tcp, "modbus-rtu": rtu}
+    mbpoll, tcp, rtu, raw = needs("mbpoll"), free_port(), free_port(), free_port()
+    doors = {"modbus-tcp": tcp, "modbus-rtu": rtu, "raw": raw}
     slave = libmodbus / "modbus_slave"
     async with (
         pty_pair(tmp_path) as (ours, theirs),
@@ -76,6 +77,9 @@ async def test_four_programs_use_the_line_between_its_polls(
             [door] = [one for one in _doors(file) if one["protocol"] == "modbus-tcp"]
             assert (door["line"], door["trouble"], door["turned_away"]) == ("hall", "", 0)
             assert 0 < door["share"] < 1
+            async with ZenohPeer("client", connect=[endpoint]) as peer:
+                await _alone(raw, peer)
+                await peer.get_until("plant/press/t40", good)
             assert gateway.end() == 0
     events = [record.event for record in checked(read(tmp_path / "audit.jsonl"))]
     writes = [one for one in events if one.get("key", "").startswith("plant/press/@")]
@@ -99,6 +103,24 @@ async def _pymodbus(port: int) -> None:
         assert refused.exception_code == 2  # the slave's own
     finally:
         client.close()
+
+
+async def _alone(port: int, peer: ZenohPeer) -> None:
+    """A program that has the wire alone: the values say so."""
+    client = AsyncModbusTcpClient("127.0.0.1", port=port, framer=FramerType.RTU, timeout=5)
+    assert await client.connect()
+    try:
+        assert (await client.read_holding_registers(9000, count=2, device_id=1)).registers[
+            1
+        ] == 9001
+        maintained = partial(_has, "reason", "maintenance")
+        await peer.get_until("plant/press/t40", maintained)
+    finally:
+        client.close()
+
+
+def _has(field: str, text: str, document: Any) -> bool:
+    return bool(document.get(field) == text)
 
 
 def _is(value: int, document: Any) -> bool:

@@ -20,6 +20,7 @@ from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.plan import door_plans, door_warnings
 from gateway.parts.sharing.settings import Sharing
 from gateway.parts.sharing.stores import Step
+from gateway.parts.sharing.tunnel import Tunnel
 from gateway.parts.sharing.turns import Turns
 from gateway.parts.transfers.forecast import forecasts
 from gateway.plant.plant import Plant
@@ -75,7 +76,7 @@ class Program:
     door: OpenDoor
     replies: list[tuple[float, bytes]] = field(default_factory=list)
     closed: bool = False
-    guest: Guest = field(init=False)
+    guest: Guest | Tunnel = field(init=False)
 
     def __post_init__(self) -> None:
         guest = self.door.connect("127.0.0.1")
@@ -127,13 +128,16 @@ async def opened(settings: dict[str, Any], lines: Any = LINES) -> AsyncIterator[
         ) -> WriteResult:
             return await own.write(tag, value, by, within, repeated=repeated)
 
+    def keep(_at: int, event: str) -> None:
+        outcomes.append(event.encode())
+
     sharing = config.part(Sharing)
     assert sharing is not None
     north: Any = North()
     try:
         async with asyncio.TaskGroup() as tasks:
             [one] = sharing.doors
-            made = OpenDoor(one, Turns(plant.any_address, north), plant.duty, tasks, config)
+            made = OpenDoor(one, Turns(plant.any_address, north), plant, tasks, keep)
             for line in plant.lines:
                 tasks.create_task(line.run())
             await asyncio.sleep(2)
@@ -303,7 +307,51 @@ async def test_only_the_networks_of_the_file_connect() -> None:
         assert hall.door.document(now())["turned_away"] == 1
 
 
+def quality(hall: Hall) -> tuple[str, str | None]:
+    tag = hall.plant.tag("press/speed")
+    assert tag is not None
+    sample = hall.plant.sample(tag)
+    return sample.quality.value, None if sample.reason is None else sample.reason.value
+
+
+@on_virtual_time
+async def test_a_raw_door_gives_one_program_the_wire_alone() -> None:
+    async with opened(door("hall", "raw", idle="10s")) as hall:
+        assert quality(hall) == ("good", None)
+        program = Program(hall.door)
+        assert await program.ask(rtu("10 000a 0001 02 1234")) == rtu("10 000a 0001")
+        assert hall.door.connect("127.0.0.1") is None  # it has the wire alone
+        assert quality(hall) == ("bad", "maintenance")
+        line = hall.plant.lines[0]
+        assert line.engine.record.trouble == "laptop (127.0.0.1) has the wire"
+        tag = hall.plant.any_address.target("press", Span("holding", 10, 1))
+        [ended] = await hall.plant.write_group([(tag, 1)])
+        assert "laptop (127.0.0.1) has the wire" in str(ended)
+        assert await program.ask(rtu("03 000a 0001")) == rtu("03 02 1234")
+        await asyncio.sleep(10.5)  # it says nothing for so long
+        assert program.closed
+        await asyncio.sleep(15)
+        assert quality(hall) == ("good", None)
+        [event] = hall.outcomes
+        assert b"it had the wire, and sent 19 bytes" in event
+        assert b'"by":"door laptop, 127.0.0.1"' in event
+
+
+@on_virtual_time
+async def test_the_wire_comes_back_when_the_program_goes() -> None:
+    async with opened(door("hall", "raw")) as hall:
+        for _ in range(3):
+            program = Program(hall.door)
+            assert await program.ask(rtu("03 000a 0001")) == rtu("03 02 0000")
+            program.guest.lost(OSError("gone"))
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(15)
+        assert quality(hall) == ("good", None)
+        assert hall.door.document(now())["programs"] == []
+
+
 MISTAKES = {
+    "remove `writes`": door("hall", "raw", writes=WRITES),
     "no line hill: did you mean hall": door("hill", "modbus-tcp"),
     "can be asked by modbus-ascii, modbus-rtu or modbus-tcp": door("hall", "vigor"),
     "other machines can reach 0.0.0.0": door("hall", "modbus-tcp", listen="0.0.0.0:1502"),

@@ -22,6 +22,7 @@ from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.sharing.guest import Guest
 from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.settings import Sharing
+from gateway.parts.sharing.tunnel import Tunnel
 from gateway.parts.sharing.turns import Turns
 from gateway.plant.build import OpenPort
 from gateway.plant.plant import Plant
@@ -70,7 +71,7 @@ class Program:
     draw: random.Random
     own: int  # the register that it writes
     patience: float
-    guest: Guest | None = None
+    guest: Guest | Tunnel | None = None
     heard: bytearray = field(default_factory=bytearray)
     arrived: asyncio.Event = field(default_factory=asyncio.Event)
     value: int | None = 0  # of its register, None: a write was not acknowledged
@@ -238,7 +239,7 @@ class World:
         async with asyncio.TaskGroup() as tasks:
             work = [tasks.create_task(line.run()) for line in self.plant.lines]
             for place, settings in enumerate(self.doors):
-                door = OpenDoor(settings, turns, self.plant.duty, tasks, self.plant.config)
+                door = OpenDoor(settings, turns, self.plant, tasks, lambda _at, _event: None)
                 numbered, draw = (
                     settings.protocol == "modbus-tcp",
                     random.Random(self.draw.random()),

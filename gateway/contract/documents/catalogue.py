@@ -36,6 +36,7 @@ REASONS = {
     Reason.GARBLED: ("BadCommunicationError", "F"),
     Reason.REFUSED: ("BadConfigurationError", "F"),
     Reason.LINE_DOWN: ("BadNotConnected", "F"),
+    Reason.MAINTENANCE: ("BadOutOfService", "C"),
     Reason.OVERDUE: ("BadResourceUnavailable", "F"),
     Reason.DISABLED: ("BadOutOfService", "C"),
     Reason.NOT_A_NUMBER: ("BadSensorFailure", "F"),

@@ -2,7 +2,7 @@
 
 import asyncio
 import random
-from collections.abc import Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
 import structlog
@@ -11,10 +11,12 @@ from gateway.config import Config
 from gateway.contract.documents.state import DoorDocument
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import LineDown
-from gateway.line.send_permit import Duty
+from gateway.line.line import Line
 from gateway.parts.sharing.guest import Guest
-from gateway.parts.sharing.settings import Door
+from gateway.parts.sharing.settings import RAW, Door
+from gateway.parts.sharing.tunnel import Tunnel
 from gateway.parts.sharing.turns import Turns
+from gateway.plant.plant import Plant
 from gateway.stations.served.answering import Answerer, Answering, Wire
 from gateway.stations.served.echo import Echo
 from gateway.stations.served.registry import answerer
@@ -25,23 +27,30 @@ from gateway.transport.port import allows
 log = structlog.get_logger("gateway.line")
 REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
 T = TypeVar("T")
+Audit = Callable[[int, str], None]
 
 
 class OpenDoor:
     """The task of one door. The listener bounds the number of its programs."""
 
     def __init__(
-        self, settings: Door, turns: Turns, duty: Duty, tasks: asyncio.TaskGroup, config: Config
+        self, settings: Door, turns: Turns, plant: Plant, tasks: asyncio.TaskGroup, audit: Audit
     ) -> None:
+        config = plant.config
         self.settings = settings
         self.turns = turns
-        self.guests: set[Guest] = set()
+        self.audit = audit
+        self.line = self._line(plant)
+        self.guests: set[Guest | Tunnel] = set()
         self.devices: Mapping[int, DeviceSettings] = settings.stations(config)  # by station
         self._wire = next(one.wire for one in config.lines if one.name == settings.line)
-        self._duty = duty
+        self._duty = plant.duty
         self._tasks = tasks
         self._trouble = ""
         self._turned_away = 0
+
+    def _line(self, plant: Plant) -> Line:
+        return next(one for one in plant.lines if one.name == self.settings.line)
 
     @property
     def numbered(self) -> bool:
@@ -67,12 +76,13 @@ class OpenDoor:
             await asyncio.sleep(pause * jitter.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
 
-    def connect(self, address: str) -> Guest | None:
-        if not allows(self.settings.networks, address):
+    def connect(self, address: str) -> Guest | Tunnel | None:
+        raw = self.settings.protocol == RAW
+        if not allows(self.settings.networks, address) or (raw and self.guests):
             self._turned_away += 1
             log.debug("turned away", door=self.settings.name, address=address)
             return None
-        return Guest(self, address)
+        return Tunnel(self, address) if raw else Guest(self, address)
 
     def start(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         return self._tasks.create_task(work)
@@ -90,11 +100,11 @@ class OpenDoor:
         wire = Wire(character=self._wire.character, echo=Echo(told=False))
         return answerer(self.settings.protocol, stations, wire)
 
-    def take_over(self, config: Config) -> None:
+    def take_over(self, config: Config, plant: Plant) -> None:
         """Takes over a changed file. Programs connect again if their devices are others now."""
-        devices = self.settings.stations(config)
-        if devices != self.devices:
-            self.devices = devices
+        devices, line = self.settings.stations(config), self._line(plant)
+        if devices != self.devices or line is not self.line:
+            self.devices, self.line = devices, line
             for guest in [*self.guests]:
                 guest.leave()
 

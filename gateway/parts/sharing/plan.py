@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from gateway.config import Config
 from gateway.engine.forecast import LineForecast
-from gateway.parts.sharing.settings import Door, Sharing
+from gateway.parts.sharing.settings import RAW, Door, Sharing
 from gateway.protocols.driver import Address, AnyDriver, Span
 
 
@@ -12,6 +12,12 @@ def door_plans(config: Config, lines: Sequence[LineForecast]) -> Iterator[str]:
     """Yields a text for each door of the file."""
     loads = {line.name: line.load for line in lines}
     for door in _doors(config):
+        if door.protocol == RAW:
+            yield (
+                f"door {door.name}: a program at {door.where.host}:{door.where.port} gets the wire "
+                f"of line {door.line} alone; its values are then bad (maintenance)"
+            )
+            continue
         devices = {one.name: one.driver for one in door.stations(config).values()}
         written = "; ".join(_written(door, devices)) or "nothing"
         stations = ", ".join(f"{name} ({one.station})" for name, one in devices.items())
@@ -28,7 +34,8 @@ def door_warnings(config: Config, lines: Sequence[LineForecast]) -> list[str]:
     """Returns a sentence for each line that cannot carry its polls and its doors."""
     most: dict[str, float] = {}
     for door in _doors(config):
-        most[door.line] = max(most.get(door.line, 0.0), door.most)
+        if door.protocol != RAW:
+            most[door.line] = max(most.get(door.line, 0.0), door.most)
     return [
         f"line {line.name} is asked for {line.load + most[line.name]:.0%} of what it can carry "
         "while programs use their share: its values are then older than above; write a smaller "

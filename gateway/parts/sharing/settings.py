@@ -26,6 +26,7 @@ from gateway.transport.port import ModemAddress, Networks, TcpAddress, is_loopba
 
 _PERCENT = re.compile(r"([1-9][0-9]?) ?%\Z")
 _MOST_WRITTEN = 65_536  # addresses of one range
+RAW = "raw"
 LONGEST_WAIT = 10.0  # seconds
 USUAL_SHARE = 0.3  # of the wire time
 
@@ -45,7 +46,7 @@ class DoorSection(Section):
     """The address of the door, such as 127.0.0.1:1502."""
     protocol: Text
     """The frames that the programs send: modbus-tcp, modbus-rtu, modbus-ascii, vigor,
-    computer-link."""
+    computer-link. raw: the program has the wire alone."""
     allow: Annotated[Networks | None, Parsed(parsers.networks, NETWORKS_SCHEMA)] = None
     """The addresses that may connect, such as [10.1.0.0/16]."""
     writes: dict[str, list[Text]] = {}
@@ -56,6 +57,8 @@ class DoorSection(Section):
     """The share of the wire time that the programs get; left out: 30%."""
     reply_within: Interval = 1.0
     """Requests that wait longer get no reply: the program no longer waits for one."""
+    idle: Interval = 60.0
+    """With raw: a program that sends nothing for so long loses the wire."""
 
 
 class ShareSection(Section):
@@ -67,7 +70,7 @@ class ShareSection(Section):
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """One checked door. `reply_within` in seconds, `most` a share of 1."""
+    """One checked door. `reply_within` and `idle` in seconds, `most` a share of 1."""
 
     name: str
     line: str
@@ -77,6 +80,7 @@ class Door:
     writes: Mapping[str, tuple[Span, ...]]  # by device
     most: float
     reply_within: float
+    idle: float
 
     def stations(self, config: Config) -> dict[int, DeviceSettings]:
         """Returns the devices behind the door, by station number."""
@@ -125,11 +129,15 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
             (*path, "line"), f"there is no line {section.line}: {meant(section.line, lines)}"
         )
         return None
-    if why := _why_not(line):
+    if why := _why_not(line, raw=section.protocol == RAW):
         mistakes.add((*path, "line"), f"{line.name} {why}")
         return None
     devices = {one.name: one for one in _spoken(line, section.protocol)}
-    if not devices:
+    if section.protocol == RAW and section.writes:
+        text = "a raw door passes on all that the program sends: remove `writes`"
+        mistakes.add((*path, "writes"), text)
+        return None
+    if not devices and section.protocol != RAW:
         known = sorted({name for one in line.devices for name in relatives(one.driver.protocol)})
         text = f"its devices can be asked by {one_of(known)}" if known else "none can be asked"
         mistakes.add(
@@ -145,6 +153,7 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
         _writes(section, devices, path, place),
         USUAL_SHARE if section.most is None else section.most,
         section.reply_within,
+        section.idle,
     )
 
 
@@ -168,13 +177,15 @@ def _writes(
     return found
 
 
-def _why_not(line: LineConfig) -> str:
+def _why_not(line: LineConfig, *, raw: bool) -> str:
     if line.serve:
         return "has `serve: true`: another master owns its wire"
     if line.listen_only:
         return "only listens: it never sends a request"
     if isinstance(line.port, ModemAddress):
         return "has a modem: each request of a program would dial"
+    if raw and line.close_after:
+        return "has `close_after`: its port is not there between two rounds"
     return ""
 
 
