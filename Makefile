@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers clean sbom release bundle
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers contract clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -138,6 +138,9 @@ fuzz: .venv/ready
 
 soak: .venv/ready
 	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
+
+contract: .venv/ready
+	$(BIN)/python -m benchmarks.contract_reader --minutes $(MINUTES)
 
 mutants: .venv/ready
 	$(BIN)/python -m tests.sim.mutants --sample $(SAMPLE) --seed $(SEED) $(ONLY) \

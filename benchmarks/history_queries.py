@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from gateway.northbound.session.session_settings import configure
 from gateway.parts.history.answers.recent import MOST_RUNS
 from gateway.parts.history.historian import Historian
 from gateway.service.service import THREAD_SWITCH
-from gateway.tags import good
+from gateway.tags import Tag, good
 from tests.no_parts import NoParts
 from tests.zenoh_peer import free_endpoint
 
@@ -47,11 +47,11 @@ class Kept(NoParts):
         return self._kept
 
 
-def write(path: Path, count: int, samples: int) -> None:
-    """Records samples of the last day, `count` tags in turn."""
+def write(path: Path, some: Sequence[Tag], samples: int) -> None:
+    """Records samples of the last day, of the tags in turn."""
     historian = Historian(path, 7 * 86400.0, 4 * GIGABYTE)
     historian.start()
-    some, start = tags(count), time.time_ns() - 86400 * 10**9
+    count, start = len(some), time.time_ns() - 86400 * 10**9
     step = 80_000 * 10**9 // samples
     for at in range(0, samples, 1000):
         historian.record(
@@ -122,7 +122,7 @@ def other(*arguments: object) -> Iterator["subprocess.Popen[str]"]:
 
 def beside(folder: Path, samples: int, rounds: int, queries: int) -> None:
     path, endpoint = folder / "beside.db", free_endpoint()
-    write(path, 1000, samples)
+    write(path, tags(1000), samples)
     alone, crowded = list[float](), list[float]()
     with other("serve", endpoint, path, 1000), _session(endpoint) as session:
         for _ in range(rounds):
@@ -149,7 +149,7 @@ def _asked(session: zenoh.Session, queries: int) -> list[float]:
 
 def catch_up(folder: Path, count: int, samples: int) -> None:
     path, endpoint = folder / "catch-up.db", free_endpoint()
-    write(path, count, samples)
+    write(path, tags(count), samples)
     example = [sys.executable, "examples/catch_up.py", "--connect", endpoint]
     with other("serve", endpoint, path, count):
         begun = time.perf_counter()

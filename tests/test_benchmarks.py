@@ -18,6 +18,11 @@ TINY = [
         [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],
     ),
     ("commands", "--calls 1", [r"^\| `check` \| \d+ \|$", r"^\| `run` \| \d+ \|$"]),
+    (
+        "contract_reader",
+        "--minutes 0.02 --every 0.5",
+        [r"^value: [1-9]", r"^[1-9]\d+ documents of \d+ kinds, 0 wrong$"],
+    ),
     ("frames_noise", "0.07", [r"^gap +CR +[\d.]+ +[\d.]+ +[\d.]+$"]),
     (
         "history",
@@ -86,6 +91,11 @@ TINY = [
     ),
     ("served", "--seconds 0.5", [r"^served-1: \d+ replies, \d+ lost: median", r"^a written value"]),
     ("sim_speed", "--minutes 0.05", [r"^every +30 s: +[\d.]+ simulated hours per minute"]),
+    (
+        "slow_link",
+        "--mbit 0 --samples 2000 --seconds 0.5",
+        [r"^alarm beside an answer: \d+ arrived, ", r"^samples of the past .* answer: [1-9]"],
+    ),
     ("start", "--sizes 1 2 5", [r"^\| different \| run: 10 tags answer in [\d.]+ s \| [\d.]+"]),
     ("transactions", "--count 2 --rounds 1", [r"^  ours, 64 tags, uvloop +[\d.]+"]),
     ("upstream", "wildcards --seconds 1", [r"^after 1 s: \d+ MB$"]),

@@ -85,6 +85,11 @@ def warnings(documents: Documents) -> Iterator[str]:
             yield f"line {line}: the last call failed: {calls['last_failure']}"
     for device, other in documents["status"]["refused_devices"].items():
         yield f"{device} is served by another gateway, {other}"
+    if key := documents["status"].get("answered_elsewhere"):
+        yield (
+            f"another program answers queries of {key}, such as a storage of Zenoh: its values may "
+            "be old and look good"
+        )
     yield from _held_up(documents, unreachable)
     reload = documents.get("reload", {})
     if reload.get("refused"):

@@ -289,6 +289,12 @@ class Northbound:
             await off_loop(self._incoming.changed)  # a reload came between
             log.info("Zenoh session ready", prefix=self.keys.prefix, id=str(session.zid()))
             tasks.create_task(self._republisher.run())
+            tasks.create_task(self._admission.claiming.notice_answers(session, self._some_key))
+
+    def _some_key(self) -> str | None:
+        """Returns the key of a value of this gateway; None: it has none."""
+        tags = (tag for device in self._plant.devices() for tag in device.tags)
+        return next((self.keys.value(tag.key) for tag in tags), None)
 
     async def _after_lost_routers(self) -> None:
         lost = self._links.router_lost

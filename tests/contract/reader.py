@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from typing import Any, NamedTuple
 
 from tests.schema_check import violations
@@ -42,16 +43,21 @@ def strict(schema: Any) -> Any:
 
 
 class Reader:
-    """Validates documents by their keys. `seen`: the names of their kinds."""
+    """Validates documents by their keys. `count`: by kind, those that fit."""
 
     def __init__(self, described: dict[str, Any], prefix: str) -> None:
-        self.seen = set[str]()
+        self.count = Counter[str]()
         self.wrong: list[str] = []
         self._shared = strict(described["$defs"])
         self._documents = [
             Document(name, _pattern(one["key"], prefix), one["verbs"], strict(one["schema"]))
             for name, one in described["documents"].items()
         ]
+
+    @property
+    def seen(self) -> set[str]:
+        """The names of the kinds that were read."""
+        return {*self.count}
 
     @property
     def names(self) -> set[str]:
@@ -61,7 +67,7 @@ class Reader:
         """Notes what is wrong with a document: no kind has its key, or none has its shape."""
         kinds = [one for one in self._documents if verb in one.verbs and one.key.fullmatch(key)]
         fits = [one.name for one in kinds if not self.violations(one.name, document)]
-        self.seen |= {*fits}
+        self.count.update(fits)
         if not fits:
             places = {one.name: self.violations(one.name, document) for one in kinds}
             self.wrong.append(f"{verb} {key}: {places}: {json.dumps(document)[:500]}")

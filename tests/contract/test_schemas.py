@@ -4,31 +4,34 @@ import asyncio
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
 from benchmarks import schemas
 from gateway.config import load
 from gateway.contract.access import certificates
-from gateway.contract.documents.catalogue import FILE, GET, KINDS, PAST, SEND, SUBSCRIBE
+from gateway.contract.documents.catalogue import FILE, KINDS, PAST, SEND
 from gateway.contract.documents.introspection import introspection
 from gateway.contract.keys import CONTRACT, Keys
 from gateway.contract.meta import meta
 from gateway.tags.tag import WriteRule
+from tests.contract.faulty_plant import (
+    QUERIES,
+    REQUESTS,
+    SUBSCRIBED,
+    Plant,
+    faulty_plant,
+    replied,
+    subscribed,
+)
 from tests.contract.reader import Reader
 from tests.e2e.processes import (
-    Program,
-    free_port,
     plc_gateway,
-    started,
-    station,
-    vigor_line,
-    write_config,
 )
 from tests.northbound.plant import PlainDevice
 from tests.northbound.plant import tag as tag_of
-from tests.zenoh_peer import TIMEOUT, Received, Reply, ZenohPeer, free_endpoint
+from tests.zenoh_peer import TIMEOUT, ZenohPeer
 
 ROOT = Path(__file__).parents[2]
 CHANGED = (
@@ -122,95 +125,11 @@ def test_the_command_prints_the_schemas() -> None:
 
 # -- a running plant -------------------------------------------------------------------------------
 
-TAGS = {
-    "speed": {"address": "D10", "history": True},  # counts
-    "recipe": {"address": "D500", "write": {"min": 1, "max": 40, "verify": True}, "history": True},
-    "trim": {"address": "D501", "write": True},
-    "hole": {"address": "D700"},
-    "level": {
-        "address": "D20",
-        "scale": 0.1,
-        "decimals": 1,
-        "clamp": [0, 100],
-        "alarm": {"high": 80, "hysteresis": 1, "text": "full"},
-    },
-    "mode": {"address": "D21", "enum": {0: "off", 1: "auto"}, "write": True},
-    "steps": {"address": "D510", "type": "uint16[4]"},
-    "name": {"address": "D600", "type": "string[8]"},
-    "plain": {"address": "D30", "payload": "raw"},
-    "double": {"computed": "speed * 2"},
-    "power": {"address": "D40", "type": "float32"},
-}
-_LINK = {"protocol": "computer-link", "control": True, "frame_format": 4}
-LINES = {
-    "sim": {
-        "port": "simulator",
-        "baudrate": 19200,
-        "format": "7E1",
-        "devices": {
-            "oven": {
-                **_LINK,
-                "station": 5,
-                "blocks": True,
-                "tags": {"heat": {"address": "D0100", "write": True}},
-            }
-        },
-    },
-    "gone": {
-        "port": f"tcp://127.0.0.1:{free_port()}",
-        "devices": {
-            "far": {
-                "protocol": "modbus-tcp",
-                "station": 1,
-                "tags": {"flow": {"address": "holding:1"}},
-            }
-        },
-    },
-}
-SERVED = {
-    "serve": True,
-    "devices": {
-        "panel": {
-            "protocol": "modbus-tcp",
-            "tags": {"shown": {"address": "holding:0", "source": "mixer/speed"}},
-        }
-    },
-}
-
-
-class Plant(NamedTuple):
-    endpoint: str
-    plc: Program
-
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    """A plant with a PLC that loses replies and lacks an address, a dead line, a served one."""
-    folder = tmp_path_factory.mktemp("plant")
-    endpoint, own = free_endpoint(), str(folder / "tty")
-    hall = vigor_line(own, TAGS, retries=0)
-    hall["devices"]["mute"] = {
-        **hall["devices"]["mixer"],
-        "station": 2,
-        "tags": {"a": {"address": "D1"}},
-    }
-    door = {"line": "hall", "listen": f"127.0.0.1:{free_port()}", "protocol": "vigor"}
-    config = write_config(
-        folder / "config.yaml",
-        endpoint,
-        {**LINES, "hall": hall, "panel": {"port": f"tcp://127.0.0.1:{free_port()}", **SERVED}},
-        history={"path": "history.db"},
-        alarms={"path": "alarms.json", "devices": True, "lines": True},
-        gateway={"name": "demo", "standby": "hall", "audit": "audit.jsonl"},
-        share={"doors": {"laptop": door}},
-        transfers=[{"from": "mixer/speed", "to": "mixer/trim", "every": "1s", "stale": "9s"}],
-    )
-    with station("pty", own, stations=(1, 2)) as plc:
-        plc.tell("hole 1 D 700")
-        plc.tell("count 1 D 10")
-        plc.tell("mute 2")
-        with started(config):
-            yield Plant(endpoint, plc)
+    with faulty_plant(tmp_path_factory.mktemp("plant")) as found:
+        yield found
 
 
 async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
@@ -220,28 +139,7 @@ async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
         assert served.json == COMMITTED
         reader = Reader(served.json, "plant")
 
-        heard = [await client.subscribe(key) for key in (
-            "plant/**",
-            "plant/*/@block",
-            "plant/@gateway/**",
-            "plant/@gateway/demo/lines/hall/@trace",
-        )]  # fmt: skip
-        requests = [
-            ("plant/mixer/recipe/@set", b"5"),
-            ("plant/mixer/recipe/@set", b"99"),
-            ("plant/mixer/speed/@set", b"1"),
-            ("plant/mixer/@set", b'{"recipe": 6, "trim": 1}'),
-            ("plant/mixer/@set", b'{"recipe": 6, "speed": 1}'),
-            ("plant/mute/a/@set", b"1"),
-            ("plant/oven/heat/@set", b"7"),
-            ("plant/oven/@run", b""),
-            ("plant/oven/@loopback", b"AB"),
-            ("plant/@gateway/demo/lines/sim/global", b"on"),
-            ("plant/mixer/@peek", b"D10..D12"),
-            ("plant/mixer/@peek", b"nothing"),
-            ("plant/@gateway/demo/alarms/mixer/level", b'{"by": "Ana"}'),
-            ("plant/@gateway/demo/alarms/mixer/level", b"{}"),
-        ]
+        heard = [await client.subscribe(key) for key in SUBSCRIBED]
         await client.get_until("plant/mixer/recipe", lambda one: one["quality"] == "good")
         plant.plc.tell("set 1 D 20 1500")  # 150.0, beyond its clamp
         alarm = "plant/@gateway/demo/alarms/mixer/level"
@@ -249,8 +147,8 @@ async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
         answered = {kind.name for kind in KINDS if kind.verbs == (SEND,)}
         async with asyncio.timeout(TIMEOUT):
             while not answered <= reader.seen:  # a busy machine may refuse one
-                for (key, _), replies in zip(requests, await client.many(requests), strict=True):
-                    _read(reader, key, SEND, replies)
+                for (key, _), replies in zip(REQUESTS, await client.many(REQUESTS), strict=True):
+                    replied(reader, key, SEND, replies)
         plant.plc.tell("deaf")
         line = "plant/@gateway/demo/lines/hall"
         await client.get_until(line, lambda one: not one["open"])
@@ -258,52 +156,17 @@ async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
         await client.get_until(line, lambda one: one["open"])
         await client.get_until("plant/mixer/recipe", lambda one: one["quality"] == "good")
 
-        queries = {
-            GET: [
-                "plant/**",
-                "plant/**/@meta",
-                "plant/*/@block",
-                "plant/@gateway/**",
-                "plant/@gateway/*/@describe",
-                "plant/@gateway/*/@introspect",
-                "plant/mixer/**?page=3",
-                "plant/mixer/speed?max_age=0s",
-                "plant/mixer/speed?max_age=never",
-            ],
-            PAST: [
-                "plant/mixer/**?_time=[now(-1h)..]",
-                "plant/mixer/speed?_time=[now(-1h)..];bucket=1h",
-                "plant/mixer/recipe?_time=[never]",
-                "plant/@gateway/demo/writes?_time=[now(-1h)..]",
-                "plant/@gateway/demo/alarms/**?_time=[now(-1h)..]",
-                "plant/@gateway/demo/audit/*?_time=[now(-1h)..]",
-            ],
-        }
-        for verb, selectors in queries.items():
+        for verb, selectors in QUERIES.items():
             for selector in selectors:
                 replies = await client.get(selector, consolidation="NONE", accept_replies="ANY")
                 assert replies, selector
-                _read(reader, selector.partition("?")[0], verb, replies)
+                replied(reader, selector.partition("?")[0], verb, replies)
         told = await client.get_until("plant/@gateway/demo/@introspect", lambda _: True)
         assert "run" in told["devices"]["oven"]["commands"]
         assert (told["signed"], told["history"]) == (False, True)
         for subscription in heard:
             await subscription.until(lambda one: bool(one.samples))
             for sample in subscription.samples:
-                _subscribed(reader, sample)
+                subscribed(reader, sample)
     assert reader.wrong == []
     assert reader.names - reader.seen == {"certificates", "outcome: suppressed"}
-
-
-def _read(reader: Reader, key: str, verb: str, replies: list[Reply]) -> None:
-    for reply in replies:
-        if reply.encoding == "application/json":
-            assert reply.ok or "error" in reply.json
-            reader.read(reply.key or key, verb, reply.json)
-
-
-def _subscribed(reader: Reader, sample: Received) -> None:
-    if sample.attachment:
-        reader.read(sample.key, SUBSCRIBE, json.loads(sample.attachment))
-    if sample.encoding == "application/json" and sample.payload:
-        reader.read(sample.key, SUBSCRIBE, sample.json)

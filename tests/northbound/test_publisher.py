@@ -10,6 +10,8 @@ import time
 from functools import partial
 from typing import Any
 
+import zenoh
+
 from gateway.contract.keys import Keys
 from gateway.northbound.publishing.losses import Losses
 from gateway.northbound.publishing.publisher import EVENTS_LIMIT, Publisher
@@ -62,15 +64,19 @@ class StuckSession:
         self.go = threading.Event()
         self.hangs = threading.Event()
         self.puts: list[tuple[int, str, Any]] = []
+        self.priorities: list[zenoh.Priority] = []
         self._clock = itertools.count()
 
     def new_timestamp(self) -> int:
         return next(self._clock)
 
-    def put(self, key: str, data: bytes, *, timestamp: int, **_how: object) -> None:
+    def put(
+        self, key: str, data: bytes, *, timestamp: int, priority: zenoh.Priority, **_how: object
+    ) -> None:
         self.hangs.set()
         assert self.go.wait(5)
         self.puts.append((timestamp, key, json.loads(data)["value"]))
+        self.priorities.append(priority)
 
 
 async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order() -> None:
@@ -97,6 +103,41 @@ async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order(
     assert session.puts == sorted(session.puts)  # by their stamps
     assert publisher.counters.superseded == 19_998
     assert publisher.counters.published == 5
+
+
+async def test_outcomes_and_alarms_go_before_values_and_documents_that_wait() -> None:
+    plant = mixer()
+    keys, session = Keys("plant", "demo"), StuckSession()
+    publisher = Publisher(keys, Losses(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    publisher.values([plant.now("mixer/speed", 0)])
+    await asyncio.to_thread(session.hangs.wait, TIMEOUT)
+    publisher.values([plant.now("mixer/recipe", 1)])
+    publisher.document(keys.status("zenoh"), b'{"value": 2}')
+    publisher.document(keys.writes, b'{"value": 3}')
+    publisher.document(keys.writes, b'{"value": 4}')
+    for value in (5, 6):  # the latest of each key
+        publisher.latest(keys.status("alarms/mixer"), f'{{"value": {value}}}'.encode)
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+    assert [value for *_, value in session.puts] == [0, 3, 4, 6, 1, 2]
+    urgent, low = zenoh.Priority.INTERACTIVE_HIGH, zenoh.Priority.DATA_LOW
+    assert session.priorities == [low, urgent, urgent, urgent, low, low]
+    assert publisher.counters.published == 6
+
+
+async def test_outcomes_beyond_the_limit_are_dropped_and_counted() -> None:
+    keys, session = Keys("plant", "demo"), StuckSession()
+    publisher = Publisher(keys, Losses(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    publisher.values([mixer().now("mixer/recipe", 0)])
+    await asyncio.to_thread(session.hangs.wait, TIMEOUT)
+    for value in range(EVENTS_LIMIT + 5):
+        publisher.document(keys.writes, f'{{"value": {value}}}'.encode())
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+    assert publisher.counters.dropped == 5
+    assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
 
 
 async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:

@@ -84,7 +84,12 @@ async def test_status_is_answered_and_published() -> None:
         assert reply.json == {"load": 0.5}
         received = await client.subscribe("plant/@gateway/*/status")
         status = (await received.next(lambda _: True)).json
-        assert status == {"state": "running", "refused_devices": {}, "refused_claims": []}
+        assert status == {
+            "state": "running",
+            "refused_devices": {},
+            "refused_claims": [],
+            "answered_elsewhere": None,
+        }
         [claimed] = await client.get(claim)
         assert claimed.json["devices"] == ["mixer", "oven"]
 

@@ -118,6 +118,7 @@ class PlainNorth:
             "devices": {},
             "refused_devices": {},
             "refused_claims": [],
+            "answered_elsewhere": None,
         }
         return {
             "status": status,

@@ -309,7 +309,9 @@ class Client:
         from gateway.cli.client.signing import signature  # with all about tags
 
         timeout = REPLY_TIMEOUT + dialling
-        with self._session.declare_querier(key, timeout=timeout) as querier:
+        # The reply has the priority of the query: before values and long answers.
+        urgent = zenoh.Priority.INTERACTIVE_HIGH
+        with self._session.declare_querier(key, timeout=timeout, priority=urgent) as querier:
             served = any(reply.ok is not None for reply in self._query(documents))
             matches = querier.matching_status
             if not (served and matches.matching):  # type: ignore[attr-defined]  # not in the stub

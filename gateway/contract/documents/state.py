@@ -28,6 +28,7 @@ class StatusDocument(TypedDict):
     devices: dict[str, Standing]
     refused_devices: dict[str, str]
     refused_claims: list[str]
+    answered_elsewhere: str | None
 
 
 class Measured(TypedDict):

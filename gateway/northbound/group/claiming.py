@@ -6,7 +6,7 @@ A claim is a document below the gateway's status keys, and a liveliness token on
 
 import asyncio
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
 
 import structlog
@@ -54,6 +54,7 @@ class Claiming:
         self._refused = refused
         self.withheld: Mapping[str, str] = {}  # with the gateways that serve them
         self.namesake = False  # another gateway with this name serves
+        self.answered_elsewhere: str | None = None  # a key of which another program has answers
         self._keys = keys
         self._group = group
         self._devices = frozenset(devices)
@@ -97,7 +98,24 @@ class Claiming:
 
     def status(self) -> dict[str, object]:
         """The fields of the gateway's status document."""
-        return {"refused_devices": self.withheld, "refused_claims": self._documents.refused}
+        return {
+            "refused_devices": self.withheld,
+            "refused_claims": self._documents.refused,
+            "answered_elsewhere": self.answered_elsewhere,
+        }
+
+    async def notice_answers(
+        self, session: zenoh.Session, key: Callable[[], str | None], every: float = 30.0
+    ) -> None:
+        """Asks other programs for the value at `key` until cancelled. A storage of Zenoh would
+        answer with old values that look good. `session`: the gateway's own."""
+        while True:
+            await asyncio.sleep(every)  # a gateway whose place this one takes may answer still
+            replies = [] if (asked := key()) is None else await off_loop(_query, session, asked)
+            answered = any(reply.ok is not None for reply in replies)
+            if answered and self.answered_elsewhere is None:
+                log.warning("queries answered by another program", key=asked, so="it may be old")
+            self.answered_elsewhere = asked if answered else None
 
     async def run(self, session: zenoh.Session, second: SecondSession) -> None:
         """Claims, then observes until cancelled. `session` is the gateway's own."""

@@ -1,5 +1,7 @@
 """The one thread that puts on Zenoh, fed by a map that holds only the last value of each tag.
 
+Alarms and outcomes of writes are urgent: they go before all that waits, here and on each link.
+
 A put can block for as long as the network is congested, so the event loop never does one. The
 queue is bounded by the number of tags: a newer value replaces one that is still waiting.
 Every entry gets its time stamp when it is queued and leaves in that order, because Zenoh's
@@ -18,7 +20,6 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from itertools import count
 
 import structlog
 import zenoh
@@ -64,7 +65,7 @@ class Publisher:
         self._session: zenoh.Session | None = None
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._waiting: dict[Hashable, _Entry] = {}
-        self._serial = count()
+        self._urgent: dict[Hashable, _Entry] = {}
         self._value_keys: dict[Tag, str] = {}  # cached: building one takes as long as queueing it
         self._waiting_events = 0
         self._blocks = Counter[str]()  # sent since the start, by key
@@ -139,19 +140,20 @@ class Publisher:
             self._queue_event(self._keys.value(sample.tag.key), sample)
 
     def document(self, key: str, document: bytes) -> None:
-        """Queues a status document or the outcome of a write."""
+        """Queues a status document, or the outcome of a write, which is urgent."""
         self._queue_event(key, document)
 
     def latest(self, key: str, make: Callable[[], bytes]) -> None:
-        """Queues a document that the publishing thread makes: only the latest of each key is put.
+        """Queues an urgent document that the publishing thread makes: only the latest of each key
+        is put.
 
         Opening a session publishes all of them.
         """
         if self._session is None or self._closing:
             return
         with self._filled:
-            self._waiting.pop(key, None)
-            self._waiting[key] = (self._session.new_timestamp(), key, make)
+            self._urgent.pop(key, None)
+            self._urgent[key] = (self._session.new_timestamp(), key, make)
             self._filled.notify()
 
     def set_online(self, device: str, online: bool) -> None:
@@ -172,12 +174,15 @@ class Publisher:
             self._value_keys.pop(tag, None)
 
     def _queue_event(self, key: str, data: Sample | bytes) -> None:
+        urgent = key == self._keys.writes
         with self._filled:
-            if self._session is None or self._closing or self._waiting_events >= EVENTS_LIMIT:
+            waiting = len(self._urgent) if urgent else self._waiting_events
+            if self._session is None or self._closing or waiting >= EVENTS_LIMIT:
                 self.counters.dropped += 1
                 return
-            self._waiting_events += 1
-            self._waiting[next(self._serial)] = (self._session.new_timestamp(), key, data)
+            self._waiting_events += not urgent
+            queue = self._urgent if urgent else self._waiting
+            queue[object()] = (self._session.new_timestamp(), key, data)
             self._filled.notify()
 
     # -- any thread --
@@ -213,17 +218,23 @@ class Publisher:
                 now = time.monotonic()
                 self._losses.sent(_samples(data), now - before, now)
                 before = now
+                if self._urgent:
+                    batch += self._next_batch()
 
     def _next_batch(self) -> list[_Entry]:
-        """Returns all waiting entries, the first at the end; empty only when the publisher ends.
+        """Returns all urgent entries, or else all others that wait, the first at the end; empty
+        only when the publisher ends.
 
         The caller frees the entries one by one: freeing 50,000 at once holds up the loop for 5 ms.
         """
         with self._filled:
-            while not self._waiting and not self._closing:
+            while not (self._waiting or self._urgent or self._closing):
                 self._filled.wait()
-            waiting, self._waiting = self._waiting, {}
-            self._waiting_events = 0
+            if self._urgent:
+                waiting, self._urgent = self._urgent, {}
+            else:
+                waiting, self._waiting = self._waiting, {}
+                self._waiting_events = 0
         batch = list(waiting.values())
         batch.reverse()
         return batch
@@ -238,7 +249,7 @@ class Publisher:
         if isinstance(data, Sample):
             encoding.put(session, key, data, stamp)
         elif isinstance(data, bytes):
-            encoding.put_json(session, key, data, stamp)
+            encoding.put_json(session, key, data, stamp, urgent=key == self._keys.writes)
         elif isinstance(data, dict):
             self._blocks[key] += 1
             place = payload.place(str(session.zid()), self._blocks[key])
@@ -247,7 +258,7 @@ class Publisher:
             self._set_token(session, key, declared=data)
             return
         else:
-            encoding.put_json(session, key, data(), stamp)
+            encoding.put_json(session, key, data(), stamp, urgent=True)
         self.counters.published += 1
 
     def _set_token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:

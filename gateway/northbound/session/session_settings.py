@@ -32,14 +32,16 @@ _DEFAULTS: dict[str, object] = {
     # client closes it too after the lease.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 3_000_000,
     # Bytes of a socket. With the megabytes that Linux takes, a slow client behind large buffers
-    # makes no room for seconds although it reads all the time, and its link would be closed.
-    "transport/link/tcp/so_sndbuf": 256 * 1024,
+    # makes no room for seconds although it reads all the time, and its link would be closed. Zenoh
+    # sends by priority, but not what is in the socket already: at 1 Mbit/s these are half a second.
+    "transport/link/tcp/so_sndbuf": 32 * 1024,
     # A link ends when nothing arrives for the lease, and only a whole batch counts as arrived.
     # Zenoh's default of 64 kB takes 8 s at 64 kbit/s; this takes 1 s.
     "transport/link/tx/batch_size": 8192,
     # Puts and declarations come in bursts. A write that was done shall not wait behind much of a
     # long answer.
     "transport/link/tx/queue/size/control": 16,
+    "transport/link/tx/queue/size/interactive_high": 16,  # alarms and outcomes
     "transport/link/tx/queue/size/data": 4,
     "transport/link/tx/queue/size/data_low": 16,
 }
