@@ -83,13 +83,7 @@ def warnings(documents: Documents) -> Iterator[str]:
         calls = document.get("calls") or {}
         if document["open"] and calls.get("in_a_row"):
             yield f"line {line}: the last call failed: {calls['last_failure']}"
-    for device, other in documents["status"]["refused_devices"].items():
-        yield f"{device} is served by another gateway, {other}"
-    if key := documents["status"].get("answered_elsewhere"):
-        yield (
-            f"another program answers queries of {key}, such as a storage of Zenoh: its values may "
-            "be old and look good"
-        )
+    yield from _of_others(documents["status"])
     yield from _held_up(documents, unreachable)
     reload = documents.get("reload", {})
     if reload.get("refused"):
@@ -109,6 +103,17 @@ def warnings(documents: Documents) -> Iterator[str]:
         )
     if lost := documents.get("history", {}).get("lost"):
         yield f"history: {lost} samples were lost since the start"
+
+
+def _of_others(status: Document) -> Iterator[str]:
+    """Yields what other programs on Zenoh do instead of this gateway, or beside it."""
+    for device, other in status["refused_devices"].items():
+        yield f"{device} is served by another gateway, {other}"
+    if key := status.get("answered_elsewhere"):
+        yield (
+            f"another program answers queries of {key}, such as a storage of Zenoh: its values may "
+            "be old and look good"
+        )
 
 
 def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:
