@@ -246,9 +246,10 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "a rule like `outcome` for the same keys.": (USERS,),
         "This subject does not have the rule `command-none`. So it may also command all stations "
         "of a line.": (USERS,),
-        "**Alarms.** A user who may read may also acknowledge alarms, unless the user has the rule "
-        "`acknowledge-none`. Such a user reads alarms with a `get` on "
-        "`plant/@gateway/*/alarms/**`.": (USERS,),
+        # Each order about an alarm is a payload of a query on its key: one rule is for all.
+        "**Alarms.** A user who may read may also acknowledge and shelve alarms, and take them out "
+        "of service, unless the user has the rule `acknowledge-none`. Such a user reads alarms "
+        "with a `get` on `plant/@gateway/*/alarms/**`.": (USERS,),
         "**Self-description.** No wildcard matches `plant/@gateway/*/@describe` and "
         "`plant/@gateway/*/@introspect`. To let clients read [them](contract.md), add both keys to "
         "the rules `ask` and `tell`, at a router also to `offer` and `asked`.": (USERS,),
