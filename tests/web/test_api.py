@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,10 @@ from gateway.contract.payload import GroupResult
 from gateway.contract.problems import Failure, Problem
 from gateway.parts.web.server import Server
 from gateway.tags import AlarmRule, Level, WriteResult, good
+from gateway.tags.sample import uncertain
+from gateway.tags.shaping import Bounds
+from tests.conftest import needs
+from tests.e2e.processes import ROOT
 from tests.history.recorded import SPEED, history
 from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
 from tests.schema_check import violations
@@ -358,3 +363,41 @@ async def test_an_alarm_is_acknowledged_with_a_token_only(tokens: Path) -> None:
         assert (await client.ask(path, "POST", body, Content_Type="application/json")).status == 401
         assert (await client.ask(path, "POST", body, **AS_JSON)).status == 409
         assert client.north.written == [("mixer/speed", body, "web alice")]
+
+
+async def javascript(client: Client, *arguments: str) -> tuple[str, int | None]:
+    """Runs the example for JavaScript. Returns what it prints, and its exit code."""
+    command = (needs("node"), str(ROOT / "examples" / "read_and_write.mjs"))
+    address = f"http://127.0.0.1:{client.port}"
+    known = {**os.environ, "GATEWAY_TOKEN": TOKEN}
+    ran = await asyncio.create_subprocess_exec(
+        *command, address, *arguments, stdout=asyncio.subprocess.PIPE, env=known
+    )
+    printed, _ = await ran.communicate()
+    return printed.decode(), ran.returncode
+
+
+async def test_the_example_for_javascript_shows_no_value_that_is_not_good(tokens: Path) -> None:
+    speed = tag("mixer", "speed", unit="rpm", range=Bounds(0, 50))
+    played = tag("mixer", "played").with_origin("replayed")
+    lost, recipe = tag("mixer", "lost"), tag("mixer", "recipe")
+    plant = PlainPlant(PlainDevice("mixer", (speed, played, lost, recipe)))
+    plant.now("mixer/speed", 12)
+    plant.now("mixer/played", 3)
+    async with serving(plant=plant, tokens_file=tokens) as client:
+        client.north.endings[b"7"] = WriteResult(7, 0, 0.1)
+        client.north.endings[b"8"] = Failure(Problem.UNCLEAR, "no reply")
+        client.north.endings[b"9"] = Failure(Problem.BAD_VALUE, "9 is too large")
+        ran = await asyncio.gather(
+            javascript(client, "mixer/speed", "7", "0.1"),
+            javascript(client, "mixer/played", "8", "0.1"),
+            javascript(client, "mixer/lost", "9", "0.1"),
+        )
+        plant.samples["mixer/speed"] = uncertain(good(speed, 60, 1))
+        last = await javascript(client, "mixer/speed", "7", "0.1")
+    assert [*ran, last] == [
+        ("12 rpm\nwritten: 7\n", 0),
+        ("not real: 3\nunclear\n", 1),
+        ("not good: bad, starting\nnot written: 9 is too large\n", 1),
+        ("not good: uncertain, out-of-range\nwritten: 7\n", 0),
+    ]
