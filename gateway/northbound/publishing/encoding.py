@@ -5,17 +5,19 @@ attachment. An unknown value has no text that a reader could mistake for a value
 the key, with the reason in the attachment.
 """
 
+from typing import Any
+
 import zenoh
 
 from gateway.contract import payload
 from gateway.tags import Form, Sample
 
-_DROP = zenoh.CongestionControl.DROP
+_DROP = {"congestion_control": zenoh.CongestionControl.DROP}
 # Below the priority of answers. A long answer over a slow link waits for room in the queue of its
 # priority, and Zenoh makes everybody wait who sends in that priority: the publisher, for all links.
-_LOW = zenoh.Priority.DATA_LOW
+_LOW: dict[str, Any] = {**_DROP, "priority": zenoh.Priority.DATA_LOW}
 # Alarms and outcomes go before answers and values, in a queue of their own on each link.
-_URGENT = zenoh.Priority.INTERACTIVE_HIGH
+_URGENT: dict[str, Any] = {**_DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _TEXT = zenoh.Encoding.TEXT_PLAIN
 _JSON_FORM = Form.JSON  # looking up a member of an enumeration takes 0.2 µs
@@ -24,28 +26,13 @@ _JSON_FORM = Form.JSON  # looking up a member of an enumeration takes 0.2 µs
 def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
     if sample.tag.publishing.payload is _JSON_FORM:
-        data = payload.value(sample)
-        put_json(session, key, data, stamp)
+        put_json(session, key, payload.value(sample), stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)
     if text is None:
-        session.delete(
-            key,
-            congestion_control=_DROP,
-            priority=_LOW,
-            timestamp=stamp,
-            attachment=attachment,
-        )
+        session.delete(key, timestamp=stamp, attachment=attachment, **_LOW)
         return
-    session.put(
-        key,
-        text,
-        encoding=_TEXT,
-        congestion_control=_DROP,
-        priority=_LOW,
-        timestamp=stamp,
-        attachment=attachment,
-    )
+    session.put(key, text, encoding=_TEXT, timestamp=stamp, attachment=attachment, **_LOW)
 
 
 def put_json(
@@ -58,15 +45,8 @@ def put_json(
     urgent: bool = False,
 ) -> None:
     """Raises `ZError`."""
-    session.put(
-        key,
-        data,
-        encoding=_JSON,
-        congestion_control=_DROP,
-        priority=_URGENT if urgent else _LOW,
-        timestamp=stamp,
-        attachment=attachment,
-    )
+    how = _URGENT if urgent else _LOW
+    session.put(key, data, encoding=_JSON, timestamp=stamp, attachment=attachment, **how)
 
 
 def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:
