@@ -4,8 +4,6 @@ import json
 import sys
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from itertools import compress
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -28,7 +26,7 @@ from gateway.config.settings import parsers
 from gateway.errors import ConfigError
 
 _ORDER = ("active", "returned", "acknowledged", "normal")
-_URGENT = ("critical", "high", "medium", "low")
+_URGENT = {"critical": -1, "high": 0, "low": 2}  # of others 1
 _STYLES = {"active": "red", "returned": "yellow", "acknowledged": "yellow"}
 _MISTAKES = ("bad-value", "unknown-tag")
 
@@ -84,10 +82,8 @@ def alarms(
         raise ConfigError("give one of --ack, --shelve and others, with --by NAME, the operator")
     if not given:
         with reached(config, err.print) as client:
-            if past is not None:
-                _print_past(client, parsers.duration(past), as_json=as_json)
-                return
-            _print(client, watch=watch, every=every, as_json=as_json)
+            since = None if past is None else f"now(-{parsers.duration(past):g}s)"
+            _print(client, since, watch=watch, every=every, as_json=as_json)
         return
     [(do, alarm)] = given
     fields: dict[str, object] = {"by": by}
@@ -97,53 +93,32 @@ def alarms(
         fields["seconds"] = parsers.duration(for_)
     if reason is not None:
         fields["reason"] = reason
-    is_pattern = do == "acknowledge" and "*" in alarm
-    if not is_pattern and alarm not in (known := _known(config)):
-        raise ConfigError(f"there is no alarm {alarm} in {config}{suggestion(alarm, known)}")
     with reached(config, err.print) as client:
-        if is_pattern:
+        if do == "acknowledge" and "*" in alarm:
             _acknowledge_all(client, alarm, fields, as_json=as_json)
-        elif problem := _order(client, alarm, fields, as_json=as_json):
+            return
+        if alarm not in (known := [one["alarm"] for one in client.alarms()]):
+            raise ConfigError(f"there is no alarm {alarm}{suggestion(alarm, known)}")
+        if problem := _order(client, alarm, fields, as_json=as_json):
             sys.exit(USER_MISTAKE if problem in _MISTAKES else FAILED)
 
 
-def _print(client: Client, *, watch: bool, every: bool, as_json: bool) -> None:
+def _print(client: Client, since: str | None, *, watch: bool, every: bool, as_json: bool) -> None:
     if watch and not as_json:
         repeated(lambda: view(_alarms(client, every=every)))
         return
-    found = _alarms(client, every=every)
+    found = _alarms(client, every=every) if since is None else client.past_alarms(since)
     if as_json:
         print(json.dumps(found))
     else:
-        out.print(view(found))
-
-
-def _print_past(client: Client, seconds: float, *, as_json: bool) -> None:
-    found = client.past_alarms(f"now(-{seconds:g}s)")
-    if as_json:
-        print(json.dumps(found))
-    else:
-        out.print(past_view(found) if found else "no changes of alarms")
-
-
-def _known(path: Path) -> dict[str, None]:
-    """Returns the names of all alarms of the file."""
-    from gateway.config import load
-    from gateway.parts.alarms.watched import LINE  # with all protocols, as `load`
-    from gateway.tags import AlarmRule
-
-    config = load(path)
-    known = (tag for device in config.devices for tag in device.tags)
-    tags = (tag.key for tag in known if tag.feature(AlarmRule) is not None)
-    devices = (device.name for device in config.devices)
-    return dict.fromkeys([*tags, *devices, *(f"{LINE}{line.name}" for line in config.lines)])
+        out.print(view(found) if since is None else past_view(found))
 
 
 def _alarms(client: Client, *, every: bool) -> list[dict[str, Any]]:
     found = [one for one in client.alarms() if every or one["state"] != "normal" or _rest(one)]
     # Of one state and priority the newest first.
     found.sort(key=lambda one: str(one["since"]), reverse=True)
-    found.sort(key=lambda one: _URGENT.index(one.get("priority", "medium")))
+    found.sort(key=lambda one: _URGENT.get(one.get("priority", ""), 1))
     return sorted(found, key=lambda one: _ORDER.index(one["state"]))
 
 
@@ -180,8 +155,8 @@ def _order(client: Client, alarm: str, fields: dict[str, object], *, as_json: bo
             err.print(printable(f"{answer['error']}: {answer['reason']}"), style="red")
         return str(answer["error"])
     if not as_json:
-        known: Any = answer["acknowledged"] if "do" not in fields else None
-        done = known and f"acknowledged by {known['by']} at {known['time']}, now {answer['state']}"
+        by: Any = answer["acknowledged"] if "do" not in fields else None
+        done = by and f"acknowledged by {by['by']} at {by['time']}, now {answer['state']}"
         print(printable(f"{alarm}: {done or _rest(answer) or answer['state']}"))
     return ""
 
@@ -223,6 +198,8 @@ def view(found: Sequence[dict[str, Any]]) -> RenderableType:
 
 def past_view(found: Sequence[dict[str, Any]]) -> RenderableType:
     """Returns changes of alarms as a table."""
+    if not found:
+        return Text("no changes of alarms")
     table = Table(box=None, pad_edge=False)
     for column in ("time", "alarm", "priority", "what", "state", "value", "by", "text"):
         table.add_column(column)
@@ -244,8 +221,9 @@ def past_view(found: Sequence[dict[str, Any]]) -> RenderableType:
 
 
 def _state(one: dict[str, Any]) -> str:
-    suppressed = "shelved" in one, "out_of_service" in one
-    return next(compress(("shelved", "out of service"), suppressed), str(one["state"]))
+    if "shelved" in one:
+        return "shelved"
+    return "out of service" if "out_of_service" in one else str(one["state"])
 
 
 def _moment(time: str) -> str:
