@@ -170,3 +170,4 @@ def test_each_change_is_in_history() -> None:
         "acknowledged",
         rfc3339(at),
     )
+    assert not row.keys() & {"by", "via", "change"}  # `acknowledged` has them
