@@ -1,6 +1,6 @@
 # The first stage builds a virtual environment; the second runs it as an unprivileged user.
-# Name the image by its digest where you build: docs/deployment.md.
-ARG BASE=python:3.12-slim
+# The digest is that of python:3.12.14-slim-trixie for all machines; Dependabot proposes newer ones.
+ARG BASE=python:3.12-slim@sha256:78387bc3881b8273120a12ebe6c1ab22b018ccc2c9adf565ae1ac9b536e184ea
 FROM ${BASE} AS build
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./

@@ -102,6 +102,8 @@ def test_the_words_of_the_pages_are_those_of_makefile_image_and_smoke_test() -> 
 
 def test_the_image_is_built_from_files_that_exist() -> None:
     text = (ROOT / "Dockerfile").read_text()
+    assert re.search(r"^ARG BASE=python:[\w.-]+@sha256:[0-9a-f]{64}$", text, re.MULTILINE)
+    assert {line.split()[1] for line in text.splitlines() if line.startswith("FROM")} == {"${BASE}"}
     copied = re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE)
     assert {
         name for names in copied for name in names.split() if not (ROOT / name).exists()
