@@ -23,6 +23,8 @@ def verdict(request: bytes, heard: bytes, early: bytes, stray: Evidence | None) 
         return Garbled("heard only our own request", heard, evidence=Evidence.ECHO)
     if stray is Evidence.STATION:
         return Garbled(f"another station spoke: {shown}", heard, evidence=Evidence.STATION)
+    if stray is Evidence.SLOW:
+        return Garbled(f"only replies to older requests: {shown}", heard, evidence=Evidence.SLOW)
     if stray is Evidence.SHAPE:
         return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
     return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)

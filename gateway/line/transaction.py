@@ -271,6 +271,7 @@ class Transaction:
     def _stray_frame(self, frame: Any) -> None:
         """Takes a frame that answers no open request."""
         if self._takes_late(frame):
+            self._stray = self._stray or Evidence.SLOW
             return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station

@@ -73,13 +73,13 @@ def bit_device() -> Device:
     return made_device("bits", driver, WIRE, replace(driver.timing, retries=1), tags)
 
 
-def tcp_device(blocks: int = 6) -> Device:
+def tcp_device(blocks: int = 6, *, retries: int = 1) -> Device:
     """Takes several requests at once; has so many blocks of one register."""
     driver = ModbusTcp(station=1, window=4)
     tags = [
         make_tag(f"holding:{1000 * n}", driver, write=WriteRule()) for n in range(1, blocks + 1)
     ]
-    return made_device("tcp", driver, WIRE, replace(driver.timing, retries=1), tags)
+    return made_device("tcp", driver, WIRE, replace(driver.timing, retries=retries), tags)
 
 
 def weighing_machine() -> Device:

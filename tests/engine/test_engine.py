@@ -669,6 +669,26 @@ def test_polls_alongside_are_concluded_one_by_one_and_fail_together() -> None:
     assert rig.device.health.outstanding == poll.block.span
 
 
+@pytest.mark.parametrize(("beside", "state"), [(True, State.FAILING), (False, State.OFFLINE)])
+def test_a_device_that_answers_beside_a_lost_request_is_not_offline_without_retries(
+    beside: bool, state: State
+) -> None:
+    """It may take one request at a time. Probes of a network device are rare beside others."""
+    rig = Rig(tcp_device(retries=0))
+    rig.bring(State.ONLINE)
+    rig.now += 1.0
+    poll = rig.next()
+    assert isinstance(poll, Poll)
+    other, *_ = rig.engine.alongside(poll, rig.now)
+    rig.engine._in_flight.open = {  # private: two polls are enough
+        job: entry for job, entry in rig.engine._in_flight.open.items() if job in (poll, other)
+    }
+    rig.conclude(other, [5] if beside else SILENCE)
+    rig.conclude(poll, SILENCE, took=0.5)
+    rig.conclude(rig.transacted(), Settled(None), took=0.1)
+    assert rig.device.state is state
+
+
 # Results that no job can have
 
 

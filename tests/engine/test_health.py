@@ -137,6 +137,14 @@ def test_too_slow_is_kept_over_no_reply_but_not_over_other_trouble() -> None:
     assert seen == [slow, slow, noise, SILENCE]
 
 
+def test_late_answers_end_the_noise() -> None:
+    found = health()
+    found.unclear(Garbled("spoiled", evidence=Evidence.NOISE), SPAN, 0.0)
+    assert found.probes.is_noisy(1.0)
+    found.unclear(Garbled("of older requests", evidence=Evidence.SLOW), SPAN, 1.0)
+    assert not found.probes.is_noisy(2.0)
+
+
 def test_a_restart_needs_a_resync_and_keeps_the_outstanding_request() -> None:
     found, lost = health(S.FAILING), LineDown("unplugged")
     found.restart(lost)

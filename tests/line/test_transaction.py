@@ -222,6 +222,23 @@ async def test_a_repeated_numbered_reply_of_another_unit_is_no_evidence_against_
 
 
 @on_virtual_time
+async def test_only_late_answers_of_a_bridge_are_no_noise() -> None:
+    """Probes at the pace of noise kept a bridge busy for ever: it waits longer for each of them."""
+    port = FakePort()
+    port.after = lambda _: None
+    driver = ModbusTcp(station=1)
+    talk = opened(port, driver)
+    with pytest.raises(NoReply):
+        await driver.read(talk, Span("holding", 0, 1))
+    asking = asyncio.create_task(driver.read(talk, Span("holding", 4, 2)))
+    await asyncio.sleep(0.01)
+    talk.received(b"\x00\x01\x00\x00\x00\x03\x01\x83\x0b")
+    with pytest.raises(Garbled) as caught:
+        await asking
+    assert caught.value.evidence is Evidence.SLOW
+
+
+@on_virtual_time
 async def test_port_loss_ends_the_open_request_and_all_after_it() -> None:
     port = FakePort()
     port.after = lambda _: None

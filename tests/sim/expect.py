@@ -52,9 +52,10 @@ class Expectations:
             + SPOKEN
         )
         load = sum(d.load for d in line.engine.devices)
-        for device in line.engine.devices:  # each read is proven
+        for device in line.engine.devices:  # each read is proven, some by silence
             if device.is_doubtful:
-                load += sum(device.proof_seconds / block.every for block in device.blocks)
+                proof = device.proof_seconds + device.longest_reply
+                load += sum(proof / block.every for block in device.blocks)
         return longest, max(1.0, load)
 
     def every(self, bus: Bus, device: Device, tag: Tag) -> float:

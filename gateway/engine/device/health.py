@@ -168,7 +168,7 @@ class Health:
         self.consecutive_failures += 1
         if isinstance(error, Garbled) and error.evidence in OF_THE_WIRE:
             self.probes.replied_damaged(now)
-        if isinstance(error, Garbled) and error.evidence is Evidence.SHAPE:
+        if isinstance(error, Garbled) and error.evidence in (Evidence.SHAPE, Evidence.SLOW):
             self.probes.replied_late(now)
         if known and outstanding is None:
             self.unanswered.sent.append(now)

@@ -90,7 +90,8 @@ class HealthRules:
         `late`: seconds from the time-out to the late reply, if it arrived. `short`: it was a short
         probe. A device that starts is offline only after a patient one, unless it was before.
         `suspect`: a poll of addresses about which the device may be silent. The device is offline
-        only if it does not reply to the next request either, also with `retries: 0`.
+        only if it does not reply to the next request either, also with `retries: 0`. The same is
+        true if it answered another request in this time: it may take one at a time.
         """
         health = device.health
         if late is not None:
@@ -101,6 +102,8 @@ class HealthRules:
         if before is not State.OFFLINE:
             self._schedule.failed(now, took)
         unknown = before in (State.STARTING, State.OFFLINE)
+        reads = (poll.reads.at for poll in self._schedule.polls(device))
+        suspect = suspect or any(at is not None and at > now - took for at in reads)
         retries = max(device.timing.retries, suspect)
         if not unknown and health.consecutive_failures <= retries:
             return

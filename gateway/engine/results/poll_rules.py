@@ -26,7 +26,8 @@ from gateway.planning.planner import Block, describe
 from gateway.tags import Reason
 
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
-OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.ECHO)  # they say nothing of addresses
+# They say nothing of addresses.
+OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.SLOW, Evidence.ECHO)
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
