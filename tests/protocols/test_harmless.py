@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, AnyDriver, Span
+from gateway.protocols.harmless import HarmlessReads
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
@@ -80,6 +82,30 @@ async def test_a_proof_differs_from_every_resync_and_from_the_outstanding_reques
     for token in range(200):
         _, length, _ = await resynced(driver, outstanding, token, spans)
         assert length != proof
+
+
+@pytest.mark.parametrize(
+    ("size", "outstanding", "used", "most", "proof"),
+    [
+        (20, None, (), 64, 9),  # resyncs have six forms in each place
+        (20, 9, (), 64, 10),
+        (20, None, (9, 10), 64, 11),
+        (20, 9, (10,), 64, 11),
+        (9, None, (), 64, 9),
+        (9, 9, (), 64, None),
+        (8, None, (), 64, None),
+        (20, None, (), 8, None),  # no longer read is possible
+    ],
+)
+def test_a_proof_has_a_form_of_its_own_inside_the_span(
+    size: int, outstanding: int | None, used: tuple[int, ...], most: int, proof: int | None
+) -> None:
+    reads = HarmlessReads(
+        [Span("D", 100, size)],
+        None if outstanding is None else Span("D", 500, outstanding),
+        lambda span: span.size if span.size <= most else None,
+    )
+    assert reads.proof(used) == (None if proof is None else Span("D", 100, proof))
 
 
 @settings(max_examples=30)
