@@ -23,7 +23,7 @@ from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
 from tests.sim.obeyed import all_times, counts, most_requests, times
 
-SPOKEN = 1.0  # seconds: the longest write, with its resync, and the read before it
+SPOKEN = 1.5  # seconds: the longest write, with a resync before and after, and the read before it
 LOOP = 0.01  # seconds: the moments of two writes are seen a little later
 LOOK = 20.0  # seconds between two looks at the states
 _DONE = WriteResult.__name__
