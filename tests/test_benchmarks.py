@@ -18,11 +18,6 @@ TINY = [
         [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],
     ),
     ("commands", "--calls 1", [r"^\| `check` \| \d+ \|$", r"^\| `run` \| \d+ \|$"]),
-    (
-        "contract_reader",
-        "--minutes 0.02 --every 0.5",
-        [r"^value: [1-9]", r"^[1-9]\d+ documents of \d+ kinds, 0 wrong$"],
-    ),
     ("frames_noise", "0.07", [r"^gap +CR +[\d.]+ +[\d.]+ +[\d.]+$"]),
     (
         "history",
@@ -106,7 +101,7 @@ TINY = [
     ),
 ]
 PICTURES = ["pictures", "--after", "0", "--sizes", "phone", "--schemes", "light", "--into"]
-BY_OTHER_TESTS = {"moves", "structure", "schemas"}  # test_structure.py, test_schemas.py
+BY_OTHER_TESTS = {"moves", "structure", "schemas", "contract_reader"}  # test_structure, _schemas
 PARTS_OF_OTHERS = {"__init__", "checkouts", "paced_wire", "plant_consumer", "words"}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import schemas
+from benchmarks import contract_reader, schemas
 from gateway.config import load
 from gateway.contract.access import certificates
 from gateway.contract.documents.catalogue import FILE, KINDS, PAST, SEND
@@ -170,3 +170,10 @@ async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
                 subscribed(reader, sample)
     assert reader.wrong == []
     assert reader.names - reader.seen == {"certificates", "outcome: suppressed"}
+
+
+async def test_a_consumer_reads_the_plant_for_some_time(plant: Plant) -> None:
+    """A slice of `make contract`."""
+    reader = await contract_reader.read(plant, seconds=0.1, every=0.1)
+    assert reader.wrong == []
+    assert {"value", "meta", "status", "introspection"} <= reader.seen
