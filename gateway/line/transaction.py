@@ -11,6 +11,7 @@ from gateway.engine.jobs.jobs import Settled, Traffic
 from gateway.errors import Busy, DeviceError, Evidence, Garbled, LineDown
 from gateway.line.channel import NEVER, SHORTEST_REPLY, Channel
 from gateway.line.timed_out import LateReply, verdict
+from gateway.protocols.capabilities import UnnumberedReplies
 from gateway.protocols.driver import Codec, EndedByGap
 
 T = TypeVar("T")
@@ -281,10 +282,15 @@ class Transaction:
         foreign = not old and getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
-        if not is_echo and not foreign and not old:
+        if not is_echo and not foreign and not old and self._may_be_reply(frame):
             self.traffic.extra += 1
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
+
+    def _may_be_reply(self, frame: Any) -> bool:
+        """Returns False for a frame that the device sends by itself, such as an on-demand block."""
+        driver = self._device.settings.driver
+        return not isinstance(driver, UnnumberedReplies) or driver.is_reply(frame)
 
     def _answer(self, request: _Request, frame: Any, answer: Any) -> None:
         """Ends a request that was answered, and learns of an echo."""

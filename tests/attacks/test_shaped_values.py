@@ -79,9 +79,9 @@ async def _shaped(plc: Program, endpoint: str) -> None:
             "detail": "division by zero",
             "origin": "computed",
         }
-        assert await read("parts") == {"value": 65530, **good}
+        assert await read("parts") == {"value": 65530, **computed}
         plc.tell("set 1 D 510 3")
-        assert await read("parts") == {"value": 65539, **good}
+        assert await read("parts") == {"value": 65539, **computed}
         assert await read("door") == {"value": False, **good}
         door = await client.subscribe("plant/mixer/door")
         plc.tell("set 1 M 5 1")
