@@ -5,7 +5,6 @@ back; the engine's effects go to the clients, the sample sink and the log.
 """
 
 import asyncio
-import random
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,11 +21,10 @@ from gateway.engine.engine import Engine
 from gateway.engine.jobs.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
 from gateway.engine.jobs.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
 from gateway.errors import CallEnded, GatewayError, Lent, LineDown
-from gateway.line import loan
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Alarm, Channel, channels
-from gateway.line.loan import Loan, OpenPort, own
+from gateway.line.opening import REOPEN_LONGEST, Loan, OpenPort, Pauses, own, pause
 from gateway.line.perform import perform
 from gateway.line.polling import RESULTS, perform_together
 from gateway.line.send_permit import Duty
@@ -37,7 +35,6 @@ from gateway.tags import Sample, Tag, WriteResult
 from gateway.transport import Port, Receiver
 
 log = structlog.get_logger("gateway.line")
-REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
 
 
 class SampleSink(Protocol):
@@ -226,8 +223,7 @@ class Line:
 
     async def run(self) -> None:
         """Serves the line until cancelled. Its errors do not end other lines."""
-        pause = REOPEN_FIRST
-        chance = random.Random(self.engine.name)  # noqa: S311  (jitter, not a secret)
+        pauses = Pauses(self.engine.name)
         while True:
             served, answered = 0.0, False
             try:
@@ -242,9 +238,8 @@ class Line:
                 self._apply()
                 await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST or answered:
-                pause = REOPEN_FIRST
-            await loan.pause(self._open_port, pause * chance.uniform(0.8, 1.2))
-            pause = min(2 * pause, REOPEN_LONGEST)
+                pauses.restart()
+            await pause(self._open_port, pauses.take())
 
     async def _open_and_serve(self) -> LineDown:
         """Opens the port and serves it. Returns the reason of the end."""

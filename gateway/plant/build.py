@@ -10,6 +10,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.line.calling import ModemOpener
 from gateway.line.line import Line, SampleSink
+from gateway.line.opening import OpenPort
 from gateway.line.rounds import ConnectionOpener
 from gateway.line.send_permit import Duty
 from gateway.simulator.plant import animate, station_for
@@ -24,8 +25,6 @@ from gateway.transport import (
     prepare,
 )
 from gateway.transport.listen_only import ListenOnlyPort
-
-OpenPort = Callable[[Receiver], Awaitable[Port]]
 
 
 class SimulatedLine:

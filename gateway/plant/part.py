@@ -184,6 +184,9 @@ class Others(Protocol):
     def each(self, capability: type[Any]) -> Sequence[Any]:
         """Returns the parts that work now and have the capability."""
 
+    def audit(self, at: int, event: str) -> None:
+        """Has the audit keep an event, as JSON; `at`: ns since 1970. Never blocks."""
+
 
 @dataclass(frozen=True, slots=True)
 class Core:

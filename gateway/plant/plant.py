@@ -19,10 +19,11 @@ from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.line import Line
+from gateway.line.opening import OpenPort
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.plant.any_address import AnyAddress
-from gateway.plant.build import OpenPort, line_of, opener
+from gateway.plant.build import line_of, opener
 from gateway.plant.doors import Doors
 from gateway.plant.expected import Adjust, Expected
 from gateway.plant.on_demand import OnDemand

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Priority(StrEnum):
-    """How soon an operator must act."""
+    """The priority of an alarm: how soon an operator must act."""
 
     CRITICAL = "critical"
     HIGH = "high"

@@ -9,7 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from gateway.errors import Unclear
-from gateway.line.line import REOPEN_LONGEST
+from gateway.line.opening import REOPEN_LONGEST
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Quality, Reason, WriteRule
 from tests.line.clocks import clocks, wind_up

@@ -17,6 +17,7 @@ from typing import Any
 
 from gateway.config import LineConfig, built
 from gateway.contract.keys import Keys
+from gateway.line.opening import OpenPort
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.sharing.guest import Guest
@@ -24,7 +25,6 @@ from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.settings import Sharing
 from gateway.parts.sharing.tunnel import Tunnel
 from gateway.parts.sharing.turns import Turns
-from gateway.plant.build import OpenPort
 from gateway.plant.plant import Plant
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.rtu import encode

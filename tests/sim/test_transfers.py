@@ -13,13 +13,13 @@ import pytest
 
 from gateway.config import LineConfig, built
 from gateway.contract.keys import Keys
+from gateway.line.opening import OpenPort
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.alarms.board import Alarms
 from gateway.parts.alarms.machine import State
 from gateway.parts.alarms.part import AlarmPart
 from gateway.parts.transfers import Transfers
-from gateway.plant.build import OpenPort
 from gateway.plant.plant import Plant
 from gateway.stations.registry import station_of
 from gateway.stations.station import Memory, Station

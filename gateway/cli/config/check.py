@@ -74,10 +74,10 @@ def check(
 def _special(config: Config, lines: Sequence[LineForecast]) -> Iterator[RenderableType]:
     """Yields what is special: lines without polls, modems, transfers, doors."""
     yield from _without_polls(config)
-    forecasts = {line.name: line for line in lines}
+    planned = {line.name: line for line in lines}
     for line in config.lines:
         if line.modem is not None or line.close_after:
-            yield Text(modem_plan(line, forecasts.get(line.name)))
+            yield Text(modem_plan(line, planned.get(line.name)))
     if config.transfers:
         yield _transfers(transfer_forecasts(config, lines))
     yield from map(Text, door_plans(config, lines))

@@ -99,7 +99,7 @@ class Acknowledgement(TypedDict):
 
 
 class Suppressed(TypedDict):
-    """Who shelved the alarm, or took it out of service, and why; `until`: of a shelved one."""
+    """A shelved alarm, or one out of service: by whom, and why; `until`: of a shelved one."""
 
     by: str
     time: Time

@@ -27,7 +27,7 @@ from gateway.parts.alarms.machine import Acknowledgement, Event, State, Suppress
 from gateway.parts.alarms.orders import Do, Order, parse_order
 from gateway.parts.alarms.settings import AlarmsSection
 from gateway.parts.alarms.watched import conditions, tuned
-from gateway.plant.part import Audits, Core, Kind
+from gateway.plant.part import Core, Kind
 from gateway.tags import Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
@@ -114,8 +114,7 @@ class AlarmPart:
             return
         changed = payload.document(event_fields(entry, event, self._fields(entry))).decode()
         if event in AUDITED:
-            for part in self._core.others.each(Audits):
-                part.audit(self._plant.wall(), changed)
+            self._core.others.audit(self._plant.wall(), changed)
         try:
             history = self._core.history()
         except Busy:

@@ -16,8 +16,8 @@ class WatchedSection(Section):
     """Alarms without a limit: of devices, lines or transfers."""
 
     priority: Literal["critical", "high", "medium", "low"] | None = None
-    """How soon an operator must act; left out: critical of lines, high of devices, medium of
-    transfers."""
+    """The priority: how soon an operator must act; left out: critical of lines, high of devices,
+    medium of transfers."""
     delay: Duration | None = None
     """It is an alarm after so long; left out: 0 s of devices, 3 s of others."""
     off_delay: Duration = 5.0

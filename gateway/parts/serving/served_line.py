@@ -5,9 +5,8 @@ hands what the master wrote to the sample sink.
 """
 
 import asyncio
-import random
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Protocol
 
@@ -16,6 +15,7 @@ import structlog
 from gateway.config import LineConfig
 from gateway.engine.device.records import COMPLETE, CallState, LineRecord
 from gateway.errors import LineDown
+from gateway.line.opening import REOPEN_LONGEST, OpenPort, Pauses
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.parts.serving.conversation import Conversation
@@ -27,8 +27,6 @@ from gateway.stations.served.station import Presence, Station
 from gateway.tags import Sample
 from gateway.transport import (
     ModemAddress,
-    Port,
-    Receiver,
     TcpAddress,
     open_modem,
     open_port,
@@ -37,10 +35,7 @@ from gateway.transport import (
 from gateway.transport.listen import Listener
 
 log = structlog.get_logger("gateway.line")
-REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
 NEVER = float("inf")
-
-OpenPort = Callable[[Receiver], Awaitable[Port]]
 
 
 class ServedSink(Protocol):
@@ -99,7 +94,7 @@ class ServedLine:
 
     async def run(self) -> None:
         """Serves the line until cancelled. Its errors do not end other lines."""
-        pause, jitter = REOPEN_FIRST, random.Random(self.name)  # noqa: S311  (no secret)
+        pauses = Pauses(self.name)
         while True:
             begun = _now()
             try:
@@ -109,9 +104,8 @@ class ServedLine:
                 (log.debug if known else log.warning)("line down", line=self.name, why=str(error))
                 self._closed(str(error))
             if _now() - begun > REOPEN_LONGEST:
-                pause = REOPEN_FIRST
-            await asyncio.sleep(pause * jitter.uniform(0.8, 1.2))
-            pause = min(2 * pause, REOPEN_LONGEST)
+                pauses.restart()
+            await asyncio.sleep(pauses.take())
 
     async def _open_and_serve(self) -> None:
         """Serves until the port is lost. Raises `LineDown`."""

@@ -127,11 +127,24 @@ class Guest:
                 self.leave()
 
     def document(self, now: float) -> GuestDocument:
-        return {
-            "address": self._address,
-            "since": round(now - self._since, 1),
-            "requests": self._requests,
-            "writes": self._writes,
-            "refused": self._refused,
-            "unanswered": self._unanswered,
-        }
+        counts = (self._requests, self._writes, self._refused, self._unanswered)
+        return guest_document(self._address, now - self._since, *counts)
+
+
+def guest_document(
+    address: str,
+    since: float,
+    requests: int = 0,
+    writes: int = 0,
+    refused: int = 0,
+    unanswered: int = 0,
+) -> GuestDocument:
+    """Returns the document of one program; `since`: seconds ago."""
+    return {
+        "address": address,
+        "since": round(since, 1),
+        "requests": requests,
+        "writes": writes,
+        "refused": refused,
+        "unanswered": unanswered,
+    }

@@ -1,7 +1,6 @@
 """A door while the gateway runs: its port, and the programs that are connected."""
 
 import asyncio
-import random
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
@@ -12,6 +11,7 @@ from gateway.contract.documents.state import DoorDocument
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import LineDown
 from gateway.line.line import Line
+from gateway.line.opening import Pauses
 from gateway.parts.sharing.guest import Guest
 from gateway.parts.sharing.settings import RAW, Door
 from gateway.parts.sharing.tunnel import Tunnel
@@ -19,13 +19,12 @@ from gateway.parts.sharing.turns import Turns
 from gateway.plant.plant import Plant
 from gateway.stations.served.answering import Answerer, Answering, Wire
 from gateway.stations.served.echo import Echo
-from gateway.stations.served.registry import answerer
+from gateway.stations.served.registry import answerer, is_numbered
 from gateway.stations.store import Store
 from gateway.transport.listen import Listener
 from gateway.transport.port import allows
 
 log = structlog.get_logger("gateway.line")
-REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
 T = TypeVar("T")
 Audit = Callable[[int, str], None]
 
@@ -36,14 +35,12 @@ class OpenDoor:
     def __init__(
         self, settings: Door, turns: Turns, plant: Plant, tasks: asyncio.TaskGroup, audit: Audit
     ) -> None:
-        config = plant.config
         self.settings = settings
         self.turns = turns
         self.audit = audit
         self.line = self._line(plant)
         self.guests: set[Guest | Tunnel] = set()
-        self.devices: Mapping[int, DeviceSettings] = settings.stations(config)  # by station
-        self._wire = next(one.wire for one in config.lines if one.name == settings.line)
+        self.devices: Mapping[int, DeviceSettings] = settings.stations(plant.config)  # by station
         self._duty = plant.duty
         self._tasks = tasks
         self._trouble = ""
@@ -55,17 +52,18 @@ class OpenDoor:
     @property
     def numbered(self) -> bool:
         """A reply has the number of its request, so it is never taken for another one."""
-        return self.settings.protocol == "modbus-tcp"
+        return is_numbered(self.settings.protocol)
 
     async def run(self) -> None:
         """Serves until cancelled."""
-        pause, jitter = REOPEN_FIRST, random.Random(self.settings.name)  # noqa: S311  (no secret)
+        pauses = Pauses(self.settings.name)
         while True:
             listener = Listener(self.settings.where)
             try:
                 await listener.open()
                 log.info("door open", door=self.settings.name, line=self.settings.line)
-                self._trouble, pause = "", REOPEN_FIRST
+                self._trouble = ""
+                pauses.restart()
                 await listener.serve(self.connect)
             except LineDown as error:
                 if self._trouble != str(error):
@@ -73,8 +71,7 @@ class OpenDoor:
                 self._trouble = str(error)
             finally:
                 await listener.close()
-            await asyncio.sleep(pause * jitter.uniform(0.8, 1.2))
-            pause = min(2 * pause, REOPEN_LONGEST)
+            await asyncio.sleep(pauses.take())
 
     def connect(self, address: str) -> Guest | Tunnel | None:
         raw = self.settings.protocol == RAW
@@ -97,7 +94,7 @@ class OpenDoor:
             number: Answering(self.devices[number].driver, store)
             for number, store in stores.items()
         }
-        wire = Wire(character=self._wire.character, echo=Echo(told=False))
+        wire = Wire(character=self.line.engine.wire.character, echo=Echo(told=False))
         return answerer(self.settings.protocol, stations, wire)
 
     def take_over(self, config: Config, plant: Plant) -> None:

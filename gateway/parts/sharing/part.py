@@ -8,7 +8,7 @@ from gateway.contract.documents.state import DoorDocument
 from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.settings import Sharing
 from gateway.parts.sharing.turns import Turns
-from gateway.plant.part import Audits, Core, Kind, Part, Phase
+from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.tags import Tag
 
 
@@ -26,15 +26,11 @@ class SharingPart:
         turns = {line: Turns(plant.any_address, self._core.north) for line in lines}
         async with asyncio.TaskGroup() as tasks:
             self._doors = [
-                OpenDoor(door, turns[door.line], plant, tasks, self._audit)
+                OpenDoor(door, turns[door.line], plant, tasks, self._core.others.audit)
                 for door in self._sharing.doors
             ]
             for door in self._doors:
                 tasks.create_task(door.run())
-
-    def _audit(self, at: int, event: str) -> None:
-        for part in self._core.others.each(Audits):
-            part.audit(at, event)
 
     async def take_over(self, config: Config, renewed: Mapping[Tag, Tag]) -> None:
         for door in self._doors:

@@ -70,7 +70,7 @@ class Needs:
 
 @dataclass(slots=True)
 class Outcomes:
-    """What became of the steps of one device. A `Store`."""
+    """A `Store` with the results of the steps of one device."""
 
     _read: dict[Cell, int | Denied | Rejected] = field(default_factory=dict)
     _written: dict[Cell, Denied | Rejected | None] = field(default_factory=dict)
@@ -92,7 +92,7 @@ class Outcomes:
     def read(self, area: str, start: int, count: int) -> list[int]:
         units = list[int]()
         for number in range(start, start + count):
-            unit = self._read.get((area, number)) if (area, number) in self._read else None
+            unit = self._read.get((area, number))
             if not isinstance(unit, int):
                 raise unit or Denied(Why.BAD)
             units.append(unit)

@@ -10,7 +10,7 @@ import structlog
 from gateway.contract.documents.requests import OutcomeDocument
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
-from gateway.parts.sharing.guest import MOST_WAITING
+from gateway.parts.sharing.guest import MOST_WAITING, guest_document
 from gateway.tags.timestamps import rfc3339
 from gateway.transport import Port
 
@@ -52,7 +52,7 @@ class Tunnel:
         self._bytes += len(data)
         self._spoke.set()
         if self._wire is not None:
-            self._send(data)
+            self._pass(data, self._wire)
         elif len(self._waiting) + len(data) > MOST_WAITING:
             self.leave()
         else:
@@ -67,10 +67,10 @@ class Tunnel:
         if self._work is not None:
             self._work.cancel()
 
-    def _send(self, data: bytes) -> None:
+    def _pass(self, data: bytes, port: Port | None) -> None:
         try:
-            if self._wire is not None:
-                self._wire.write(data)
+            if port is not None:
+                port.write(data)
         except LineDown:
             self.leave()
 
@@ -84,7 +84,7 @@ class Tunnel:
                 self._wire = await line.lend(f"{name} ({self._address}) has the wire", _Ear(self))
             log.warning("wire lent", line=line.name, door=name, address=self._address)
             if asyncio.get_running_loop().time() - self._since < OLD:
-                self._send(bytes(self._waiting))
+                self._pass(bytes(self._waiting), self._wire)
             self._waiting.clear()
             async with asyncio.timeout(LONGEST):
                 while True:
@@ -128,21 +128,10 @@ class Tunnel:
 
     def heard(self, data: bytes) -> None:
         """Passes bytes of the wire on."""
-        try:
-            if self._program is not None:
-                self._program.write(data)
-        except LineDown:
-            self.leave()
+        self._pass(data, self._program)
 
     def document(self, now: float) -> GuestDocument:
-        return {
-            "address": self._address,
-            "since": round(now - self._since, 1),
-            "requests": 0,
-            "writes": 0,
-            "refused": 0,
-            "unanswered": 0,
-        }
+        return guest_document(self._address, now - self._since)
 
 
 class _Ear:

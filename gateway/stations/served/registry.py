@@ -20,10 +20,11 @@ class _Served(NamedTuple):
     make: MakeAnswerer
     family: str
     common: Sequence[str] = ()
+    numbered: bool = False  # a reply has the number of its request
 
 
 _SERVED: dict[str, _Served] = {
-    "modbus-tcp": _Served(modbus_wire.tcp, "modbus"),
+    "modbus-tcp": _Served(modbus_wire.tcp, "modbus", numbered=True),
     "modbus-rtu": _Served(modbus_wire.rtu, "modbus"),
     "modbus-ascii": _Served(modbus_wire.ascii_line, "modbus"),
     "vigor": _Served(vigor, "vigor"),
@@ -37,6 +38,11 @@ def can_serve(protocol: str) -> bool:
 
 def served_protocols() -> list[str]:
     return list(_SERVED)
+
+
+def is_numbered(protocol: str) -> bool:
+    """Returns True if no reply is taken for that to another request."""
+    return can_serve(protocol) and _SERVED[protocol].numbered
 
 
 def relatives(protocol: str) -> list[str]:

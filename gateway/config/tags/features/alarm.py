@@ -39,7 +39,7 @@ class AlarmSection(Section):
     off_delay: Duration = 0.0
     """It counts until it is left for so long."""
     priority: Literal["critical", "high", "medium", "low"] = "medium"
-    """How soon an operator must act."""
+    """The priority of the alarm: how soon an operator must act."""
     text: Text = ""
     """A sentence for people; left out: the description of the tag."""
 

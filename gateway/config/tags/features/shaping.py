@@ -55,7 +55,7 @@ class ScalingSettings(Settings):
     clamp: _Bounds | None = None
     """A read outside is shown as the nearest end, such as [0, 100] or [0, null]."""
     range: _Bounds | None = None
-    """What the sensor can measure: a read outside is uncertain, such as [0, 100] or [0, null]."""
+    """The range of the sensor, such as [0, 100] or [0, null]: a read outside is uncertain."""
 
     @model_validator(mode="after")
     def _both_ends(self) -> Self:

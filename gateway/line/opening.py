@@ -1,6 +1,7 @@
-"""The port of a line while another program has it."""
+"""How a port is opened again: the pauses between two tries, and its loan to another program."""
 
 import asyncio
+import random
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import NoReturn
@@ -9,6 +10,26 @@ from gateway.errors import Lent
 from gateway.transport import Port, Receiver
 
 OpenPort = Callable[[Receiver], Awaitable[Port]]
+REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
+
+
+class Pauses:
+    """The pauses before a port is opened again. Each is twice as long as the one before."""
+
+    def __init__(self, name: str) -> None:
+        """`name`: of the line or door: many are not opened at one moment."""
+        self._next = REOPEN_FIRST
+        self._jitter = random.Random(name)  # noqa: S311  (no secret)
+
+    def restart(self) -> None:
+        """Begins with the first one again, because the port worked."""
+        self._next = REOPEN_FIRST
+
+    def take(self) -> float:
+        """Returns the next pause in seconds."""
+        seconds = self._next * self._jitter.uniform(0.8, 1.2)
+        self._next = min(2 * self._next, REOPEN_LONGEST)
+        return seconds
 
 
 class Loan:
