@@ -60,8 +60,10 @@ class AnyAddress:
         """Returns a tag of these addresses for one write. No client sees it."""
         _, receiver = self.place(device)
         driver, made = receiver.driver, self._targets.setdefault(span, {})
-        if device not in made or made[device][0] != driver:
-            made[device] = driver, _tag(device, driver, span)
+        not_real = next((tag.origin.not_real for tag in receiver.settings.wire_tags), None)
+        known, tag = made.get(device, (None, None))
+        if tag is None or known != driver or tag.origin.not_real != not_real:
+            made[device] = driver, _tag(device, driver, span).with_origin(not_real)
             if len(self._targets) > MOST_TARGETS:
                 self._targets.clear()
                 self._targets[span] = {device: made[device]}

@@ -167,6 +167,7 @@ async def test_a_program_reads_and_writes_by_rtu() -> None:
         assert await program.ask(rtu("01 0000 0008")) == rtu("01 01 08")
         assert len(hall.outcomes) == 3
         assert b'"by":"door laptop, 127.0.0.1"' in hall.outcomes[0]
+        assert all(b'"origin":"simulated"' in outcome for outcome in hall.outcomes)
 
 
 @on_virtual_time
