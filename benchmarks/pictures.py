@@ -194,7 +194,7 @@ READY["search"] = READY["tags"]
 
 async def look(situations: list[tuple[str, Path, int]], arguments: argparse.Namespace) -> None:
     arguments.into.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:  # it ends late
         async with browser(arguments.chromium, Path(profile)) as tab:
             for name, _, port in situations:
                 await taken(tab, name, port, arguments)
