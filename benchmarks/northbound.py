@@ -37,7 +37,7 @@ import zenoh
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.session.session_settings import configure
@@ -68,7 +68,7 @@ class Plant:
     made: list[Device]
     mirror: Mirror = field(init=False)
     alarms: Alarms = field(init=False)
-    duty: Duty = field(default_factory=Duty)
+    duty: SendPermit = field(default_factory=SendPermit)
 
     def __post_init__(self) -> None:
         self.tags = [tag for device in self.made for tag in device.tags]

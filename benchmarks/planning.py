@@ -14,8 +14,8 @@ from dataclasses import replace
 from functools import partial
 
 from benchmarks.words import words
+from gateway.planning.area_items import Seconds
 from gateway.planning.planner import plan
-from gateway.planning.rows import Seconds
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag

@@ -37,7 +37,7 @@ from gateway.contract.keys import Keys
 from gateway.contract.meta import meta
 from gateway.contract.problems import Problem
 from gateway.engine.device.device_settings import DeviceSettings
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.group.standby import GroupSettings, Standby
 from gateway.northbound.session.exposures import exposures
 from gateway.parts.history.historian import Historian
@@ -697,7 +697,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
         assert asking.ended() == 0
         found = dict(line.split(maxsplit=1) for line in asking.lines)
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
-    known |= Standby(GroupSettings("hall"), None, Keys("plant", "demo"), Duty()).documents()
+    known |= Standby(GroupSettings("hall"), None, Keys("plant", "demo"), SendPermit()).documents()
     known["certificates/"] = certificates.document(tmp_path, 0.0, 0.0)
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))

@@ -7,24 +7,24 @@ from datetime import datetime
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.client import Row
+from gateway.cli.client import TagRow
 from gateway.cli.terminal import out, printable
 from gateway.tags import Quality, Sample, Tag
 
 
-def row_of(sample: Sample) -> Row:
+def row_of(sample: Sample) -> TagRow:
     """Returns the row of a sample, with the payload that Zenoh would carry."""
     from gateway.contract.payload import sample_fields  # for a command that opens the port
 
-    return Row(sample.tag.key, {**sample_fields(sample)})
+    return TagRow(sample.tag.key, {**sample_fields(sample)})
 
 
-def is_good(row: Row) -> bool:
+def is_good(row: TagRow) -> bool:
     return bool(row.document.get("quality") == Quality.GOOD)
 
 
 def print_rows(
-    rows: Sequence[Row], tags: dict[str, Tag], *, as_json: bool, utc: bool = False
+    rows: Sequence[TagRow], tags: dict[str, Tag], *, as_json: bool, utc: bool = False
 ) -> None:
     """Prints a table with times of this machine's zone unless `utc`. JSON has UTC always."""
     if as_json:
@@ -34,7 +34,7 @@ def print_rows(
         out.print(table_of(rows, tags, utc=utc))
 
 
-def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) -> Table:
+def table_of(rows: Iterable[TagRow], tags: dict[str, Tag], *, utc: bool = False) -> Table:
     """Returns a table of values, with one line for each row."""
     table = Table(box=None, pad_edge=False)
     for column in ("tag", "value", "unit", "quality", "time"):

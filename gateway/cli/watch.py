@@ -8,7 +8,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.client import Row, connected, tags_by_key, wanted_keys
+from gateway.cli.client import TagRow, connected, tags_by_key, wanted_keys
 from gateway.cli.tables import print_rows, table_of
 from gateway.cli.terminal import AsJson, ConfigPath, TagNames, Utc, err, out
 from gateway.config import load
@@ -32,10 +32,10 @@ def watch(
 
 
 def show_live(
-    screen: Console, news: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False
+    screen: Console, news: Iterable[TagRow], tags: dict[str, Tag], *, utc: bool = False
 ) -> None:
     """Shows a table with the latest row of each tag until `news` ends."""
-    rows: dict[str, Row] = {}
+    rows: dict[str, TagRow] = {}
 
     def table() -> RenderableType:
         return fitted(screen, [rows[tag] for tag in sorted(rows)], tags, utc=utc)
@@ -46,7 +46,7 @@ def show_live(
 
 
 def fitted(
-    screen: Console, rows: Sequence[Row], tags: dict[str, Tag], *, utc: bool = False
+    screen: Console, rows: Sequence[TagRow], tags: dict[str, Tag], *, utc: bool = False
 ) -> RenderableType:
     """Returns the table, cut to the height of the screen with the number of hidden rows."""
     room = len(rows) if len(rows) < screen.height else max(screen.height - 2, 0)

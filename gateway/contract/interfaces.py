@@ -4,12 +4,12 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Se
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from gateway.contract.past.buckets import Bucket, Now
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.contract.payload import GroupResult
 from gateway.contract.problems import Failure
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.wire_log import WireLog
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Recorded, RecordedQuery
@@ -38,7 +38,7 @@ class Plant(Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""
 
     @property
-    def duty(self) -> Duty: ...
+    def duty(self) -> SendPermit: ...
 
     def devices(self) -> Iterable[Device]: ...
 
@@ -112,12 +112,12 @@ class History(Protocol):
         """
 
     def buckets(
-        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: Now, pause: Callable[[], None]
     ) -> Iterator[Bucket]:
         """The buckets of a tag in the order of time. Calls `pause` often. Raises like `samples`."""
 
     def newest(
-        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: int, pause: Callable[[], None]
     ) -> Iterator[Sample]:
         """The last samples of a tag in the order of time. Raises like `samples`."""
 

@@ -83,5 +83,5 @@ class ArrivalClock:
         jump = (ahead - self._ahead) / 1e9
         if abs(jump) >= JUMP:
             self._jumps, self._jump = self._jumps + 1, (jump, time.monotonic())
-            log.warning("clock jumped", seconds=round(jump, 1), so="time stamps jump too")
+            log.warning("clock jumped", seconds=round(jump, 1), effect="time stamps jump too")
         self._ahead = ahead

@@ -27,7 +27,7 @@ from gateway.line.channel import NEVER, Alarm, Channel, channels
 from gateway.line.opening import REOPEN_LONGEST, Loan, OpenPort, Pauses, own, pause
 from gateway.line.perform import perform
 from gateway.line.polling import RESULTS, perform_together
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.protocols.driver import Span
@@ -56,14 +56,14 @@ class Line:
         *,
         echo: bool | None = None,
         wall: Callable[[], int] = time.time_ns,
-        duty: Duty | None = None,
+        duty: SendPermit | None = None,
     ) -> None:
         """`echo`: the port receives its own bytes; None: not known. `wall`: ns since 1970."""
         self.engine = engine
         self._open_port: OpenPort | Loan = open_port
         self._sink = sink
         self.wire_log = WireLog()
-        duty = duty or Duty()
+        duty = duty or SendPermit()
         self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
         self.calls: DialSchedule | None = None  # while a modem is there

@@ -10,7 +10,7 @@ SETTLE = 1.0
 PROOF_VALID = 2.0
 
 
-class Duty:
+class SendPermit:
     """Says why a write or command must not be sent now. All times are those of the event loop."""
 
     def __init__(

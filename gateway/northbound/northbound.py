@@ -21,9 +21,9 @@ from gateway.errors import Busy, GatewayError
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.group.admission import Admission
 from gateway.northbound.group.standby import GroupSettings
-from gateway.northbound.publishing.losses import Losses
 from gateway.northbound.publishing.publisher import Publisher, ScanBatches
 from gateway.northbound.publishing.republish import Republisher
+from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.northbound.publishing.status_publisher import StatusPublisher
 from gateway.northbound.publishing.traces import Traces
 from gateway.northbound.requests.acceptance import Acceptance, AcceptedUntil
@@ -100,7 +100,7 @@ class Northbound:
         self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
         index = TagIndex(self.keys, plant.devices())
         self._admission = Admission(group, self.keys, self._config, index.names, plant.duty)
-        losses = Losses(drop_limit(self._config))
+        losses = SlowPuts(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
         self._batches = ScanBatches(self._publisher, index)
         self._republisher = Republisher(

@@ -5,8 +5,8 @@ A PLC keeps one list, so the planner chooses the list that saves the most wire t
 
 from collections.abc import Collection, Sequence
 
+from gateway.planning.area_items import Seconds
 from gateway.planning.planner import Block
-from gateway.planning.rows import Seconds
 from gateway.protocols.capabilities import Monitor
 from gateway.protocols.driver import AnyDriver, Span, Unit
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from gateway.errors import ConfigError
+from gateway.planning.area_items import AreaItems, Seconds, requests_of
 from gateway.planning.coalesce import Request
-from gateway.planning.rows import Row, Seconds, requests_of
 from gateway.protocols.driver import AnyDriver, Cost, Span
 from gateway.protocols.models import Model, model_of
 from gateway.tags import Tag
@@ -110,7 +110,7 @@ def _cover(
     fences = sorted(n for name, n in cuts if name == area)
     splits = (i + 1 for i, (a, b) in enumerate(pairwise(items)) if _between(a.end, b.start, fences))
     starts, ends, every = zip(*((item.start, item.end, item.every) for item in items), strict=True)
-    row = Row(area, starts, ends, every, frozenset(splits if fences else ()))
+    row = AreaItems(area, starts, ends, every, frozenset(splits if fences else ()))
     try:
         return requests_of(row, model, seconds)
     except ValueError as error:

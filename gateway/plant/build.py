@@ -12,7 +12,7 @@ from gateway.line.calling import ModemOpener
 from gateway.line.line import Line, SampleSink
 from gateway.line.opening import OpenPort
 from gateway.line.rounds import ConnectionOpener
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Station
@@ -90,7 +90,7 @@ def line_of(
     open_port: OpenPort | None = None,
     wall: Callable[[], int] = time.time_ns,
     seed: int = 0,
-    duty: Duty | None = None,
+    duty: SendPermit | None = None,
     plan_now: bool = True,
 ) -> Line:
     """Makes a line with some or all of its devices. `wall`: ns since 1970.

@@ -20,7 +20,7 @@ from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.line import Line
 from gateway.line.opening import OpenPort
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.wire_log import WireLog
 from gateway.plant.any_address import AnyAddress
 from gateway.plant.build import line_of, opener
@@ -63,7 +63,7 @@ class Plant:
         config: Config,
         wall: Callable[[], int] = time.time_ns,
         open_line: Callable[[LineConfig], OpenPort] = opener,
-        duty: Duty | None = None,
+        duty: SendPermit | None = None,
         *,
         plan_now: bool = True,
     ) -> None:
@@ -72,7 +72,7 @@ class Plant:
         Without `plan_now` each line needs `plan` and `planned` before it runs.
         """
         self.config = config
-        self.duty = duty or Duty()
+        self.duty = duty or SendPermit()
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.lines: list[Line] = []
         self._wall = wall

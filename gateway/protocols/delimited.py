@@ -11,8 +11,8 @@ Take = Callable[[bytes], tuple[Asked | Told | None, int] | int | None]
 _BROKEN = 0.5  # seconds; a frame without end does not wait for the next one
 
 
-class DelimitedEar:
-    """An `Ear` for frames that begin with one of `starts` and hold none of them."""
+class DelimitedTrafficReader:
+    """A `TrafficReader` for frames that begin with one of `starts` and hold none of them."""
 
     def __init__(self, starts: bytes, longest: int, take: Take) -> None:
         self._starts = frozenset(starts)

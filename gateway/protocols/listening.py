@@ -1,6 +1,6 @@
 """Listening to another master: requests and replies on a line where the gateway sends nothing.
 
-A driver may have this capability. Its ear finds the frames of both directions in the bytes;
+A driver may have this capability. Its reader finds the frames of both directions in the bytes;
 `Pairing` decides which reply belongs to which request. When in doubt, it belongs to none: a value
 that is not learned turns stale, and a value of another request would be shown as good.
 """
@@ -45,7 +45,7 @@ class Noise:
 Heard = Asked | Told | Noise
 
 
-class Ear(Protocol):
+class TrafficReader(Protocol):
     """Finds the frames of both directions. Does no I/O."""
 
     def feed(self, data: bytes, silence: float) -> list[Heard]:
@@ -62,10 +62,10 @@ class Listenable(Protocol):
 
     @property
     def framing(self) -> Hashable:
-        """Equal for devices whose frames one ear finds."""
+        """Equal for devices whose frames one reader finds."""
 
-    def ear(self, character: float) -> Ear:
-        """Returns a new ear. `character`: seconds of one character on the wire."""
+    def traffic_reader(self, character: float) -> TrafficReader:
+        """Returns a new reader. `character`: seconds of one character on the wire."""
 
     def learn(self, read: Any, span: Span) -> Learn | None:
         """Returns the decoder of the span; None if the read does not hold all of it."""

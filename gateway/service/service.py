@@ -16,7 +16,7 @@ from gateway.config import Config
 from gateway.errors import GatewayError
 from gateway.line.arrival import ArrivalClock
 from gateway.line.line import Line
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.northbound import Files, Northbound, group_settings
 from gateway.parts.registry import kinds
 from gateway.plant.part import Phase
@@ -100,7 +100,7 @@ async def _serve(
     """
     config = reloader.current.without(withheld)
     clock = ArrivalClock()
-    duty = Duty(clock.released, shared=config.standby is not None)
+    duty = SendPermit(clock.released, shared=config.standby is not None)
     plant = Plant(config, clock, duty=duty, plan_now=False)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from gateway.protocols.driver import Address, AnyDriver
-from gateway.protocols.listening import Asked, Ear, Listenable
+from gateway.protocols.listening import Asked, Listenable, TrafficReader
 from gateway.stations.registry import station_of
 from gateway.stations.station import Memory
 
@@ -23,7 +23,7 @@ class Change(NamedTuple):
 
 
 @dataclass(slots=True)
-class Course:
+class RecordedValues:
     """The values of the units of one device by time. Before its first value a unit has that one."""
 
     changes: list[Change] = field(default_factory=list)
@@ -48,7 +48,9 @@ class RecordedStation:
     at `begin`, when the first request arrives. After its end the last values stay.
     """
 
-    def __init__(self, driver: AnyDriver, course: Course, begin: float, answered: Answered) -> None:
+    def __init__(
+        self, driver: AnyDriver, course: RecordedValues, begin: float, answered: Answered
+    ) -> None:
         self._driver = driver
         self._station = station_of(driver)
         self._coming = sorted(course.changes, key=lambda change: change.at)[::-1]
@@ -100,10 +102,10 @@ class OtherStations:
     def __init__(
         self, drivers: Sequence[Listenable], stations: set[int], answered: Answered
     ) -> None:
-        ears: dict[object, Ear] = {}
+        readers: dict[object, TrafficReader] = {}
         for driver in drivers:
-            ears.setdefault(driver.framing, driver.ear(0.0))
-        self._ears = list(ears.values())
+            readers.setdefault(driver.framing, driver.traffic_reader(0.0))
+        self._readers = list(readers.values())
         self._stations = stations
         self._answered = answered
         self._last = -math.inf
@@ -111,8 +113,8 @@ class OtherStations:
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
         silence, self._last = now - self._last, now
-        for ear in self._ears:
-            for heard in ear.feed(data, silence):
+        for reader in self._readers:
+            for heard in reader.feed(data, silence):
                 if isinstance(heard, Asked) and heard.station not in self._stations:
                     self._answered.requests += 1
                     self._answered.unknown[f"station {heard.station}"] += 1

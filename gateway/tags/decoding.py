@@ -18,7 +18,7 @@ Decode = Callable[[Any], Value | None]
 DecodeOne = Callable[[Any], Scalar | None]  # of a value that is no array
 
 
-class Part(NamedTuple):
+class WordPart(NamedTuple):
     """The bits of a word that a tag has: one bit, or a byte. A write changes these alone."""
 
     shift: int
@@ -37,12 +37,12 @@ class Part(NamedTuple):
         return word & ~self.bits | part << self.shift
 
 
-def part_of(layout: Layout, bit: int | None) -> Part | None:
+def part_of(layout: Layout, bit: int | None) -> WordPart | None:
     """Returns the part of the word that a tag has; None: it has whole words."""
     if bit is not None:
-        return Part(bit, 1)
+        return WordPart(bit, 1)
     if layout.type.kind in BYTES:
-        return Part(8 if layout.byte is Byte.HIGH else 0, 0xFF)
+        return WordPart(8 if layout.byte is Byte.HIGH else 0, 0xFF)
     return None
 
 

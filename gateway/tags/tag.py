@@ -9,7 +9,7 @@ from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
 from gateway.tags.decoding import (
     Decode,
-    Part,
+    WordPart,
     array_decoder,
     decoder,
     field_decoder,
@@ -137,7 +137,7 @@ class Tag:
         return self.shaping.line if self.layout.type.is_number else None
 
     @property
-    def part(self) -> Part | None:
+    def part(self) -> WordPart | None:
         """The part of its word; None: whole words."""
         return part_of(self.layout, self.address.bit) if self.origin.shape is None else None
 

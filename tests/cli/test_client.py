@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gateway.cli.client import Client, Row, connected, parse_value, value_pages, wanted_keys
+from gateway.cli.client import Client, TagRow, connected, parse_value, value_pages, wanted_keys
 from gateway.config import Config, load
 from gateway.errors import ConfigError, GatewayError
 from gateway.values import Value
@@ -250,7 +250,7 @@ def test_tags_outside_the_file_are_left_out(config: Config) -> None:
         assert next(news) == ("mixer/speed", json.loads(good(4)))
 
 
-def shown_as(news: Iterator[Row]) -> object:
+def shown_as(news: Iterator[TagRow]) -> object:
     document = next(news).document
     return document.get("reason") or document["value"]
 

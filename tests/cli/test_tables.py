@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from gateway.cli.client import Row
+from gateway.cli.client import TagRow
 from gateway.cli.tables import row_of, table_of, time_text
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import tags_of
@@ -29,7 +29,7 @@ def test_a_table_of_good_and_bad_samples(tmp_path: Path) -> None:
         row_of(good(speed, -7, NOW)),
         row_of(bad(speed, Reason.NO_REPLY, NOW)),
         row_of(good(run, False, NOW)),
-        Row("other/tag", {"value": "[red]:boom:", "quality": "good", "time": "now"}),
+        TagRow("other/tag", {"value": "[red]:boom:", "quality": "good", "time": "now"}),
     ]
     header, *lines = [line.split() for line in printed(table_of(rows, tags, utc=True))]
     at = "2026-11-21T04:36:03.007430Z"

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gateway.cli.client import Row
+from gateway.cli.client import TagRow
 from gateway.cli.watch import fitted
 from tests.cli.conftest import documents, tags_of
 from tests.e2e.processes import PATIENCE, Program, gateway, started, vigor_line, write_config
@@ -120,7 +120,7 @@ def test_a_text_of_several_lines_hides_other_rows(tmp_path: Path) -> None:
 def on_a_screen(folder: Path, width: int, height: int, values: list[str]) -> list[str]:
     tags = tags_of(folder, {})
     document = {"quality": "good", "time": "2026-11-20T12:00:00.123456Z"}
-    rows = [Row(f"mixer/t{n}", {"value": value, **document}) for n, value in enumerate(values)]
+    rows = [TagRow(f"mixer/t{n}", {"value": value, **document}) for n, value in enumerate(values)]
     screen = Console(width=width, height=height, markup=False, emoji=False, highlight=False)
     with screen.capture() as capture:
         screen.print(fitted(screen, rows, tags))

@@ -19,7 +19,7 @@ from gateway.contract.documents.catalogue import REASONS
 from gateway.contract.meta import meta_fields
 from gateway.contract.past import buckets
 from gateway.contract.past.buckets import Now
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.parts.web.events import Page
 from gateway.tags import Reason, Sample, Tag, bad, good
 from gateway.tags.sample import converted
@@ -86,7 +86,7 @@ def shown(tag: Tag, value: int, folder: Path, bridges: dict[str, Any]) -> dict[s
     with history(folder / f"{tag.name}.db") as historian:
         historian.record([sample])
         [past] = historian.samples(tag, EVERYTHING, None)
-        asked, now = Question(EVERYTHING, bucket=SECOND), Now(NOON + 1, is_valid=True)
+        asked, now = HistoryQuery(EVERYTHING, bucket=SECOND), Now(NOON + 1, is_valid=True)
         [bucket] = historian.buckets(tag, asked, now, lambda: None)
     known = json.loads(payload.value(sample))
     table = table_of([row_of(sample)], {})

@@ -14,10 +14,10 @@ from gateway.cli.tables import is_good, row_of, table_of
 from gateway.config import Config, built
 from gateway.contract import payload
 from gateway.contract.past.buckets import Now
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.parts.alarms.board import Alarms
-from gateway.parts.transfers.row import Row, State
 from gateway.parts.transfers.runner import Transfers
+from gateway.parts.transfers.transfer_row import State, TransferRow
 from gateway.parts.web import metrics
 from gateway.stations.served.registers import Registers
 from gateway.stations.store import Denied
@@ -175,7 +175,7 @@ async def test_no_consumer_takes_an_uncertain_value_for_a_good_one(
         historian.record([fine, doubtful])
         assert [*historian.samples(level, EVERYTHING, None)] == [fine, doubtful]
         now = Now(NOON + 2 * SECOND, is_valid=True)
-        asked = Question(EVERYTHING, bucket=60 * SECOND)
+        asked = HistoryQuery(EVERYTHING, bucket=60 * SECOND)
         [bucket] = historian.buckets(level, asked, now, lambda: None)
     assert (bucket.min, bucket.good, bucket.bad, bucket.quality) == (50.0, 1, 1, "partial")
     assert bucket.reason == "out-of-range"
@@ -201,7 +201,7 @@ async def test_no_consumer_takes_an_uncertain_value_for_a_good_one(
     scanned.close()
 
     # Transfers: it is not carried.
-    row = Row(TransferRule(number=1, source="a/n", target="b/n", text=("a n", "b n")), 0.0)
+    row = TransferRow(TransferRule(number=1, source="a/n", target="b/n", text=("a n", "b n")), 0.0)
     plain = Fresh(PlainDevice("mixer", (level,)))
     plain.samples[level.key] = doubtful
     reading = Transfers(plain, None, [])._reading(level)  # type: ignore[arg-type]

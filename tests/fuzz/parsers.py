@@ -18,10 +18,10 @@ from gateway.contract.access import certificates, signatures
 from gateway.contract.access.writers import Writers
 from gateway.contract.keys import Keys, max_age, parse_key, part_of
 from gateway.contract.parsing import check_encoding, parse_group, parse_write
-from gateway.contract.past.question import question
+from gateway.contract.past.history_query import question
 from gateway.contract.past.timerange import EARLIEST, LATEST, time_range
 from gateway.errors import BadValue, Busy, ConfigError, NotAllowed, Repeated
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.answering.pages import recorded_place
 from gateway.northbound.group.claim_documents import ClaimDocuments
 from gateway.northbound.group.plant_secret import PlantSecret
@@ -94,7 +94,11 @@ def attachment(data: bytes) -> None:
         now = asyncio.get_running_loop().time()
         sender = Sender(None, data, now)
         with suppress(Busy):
-            assert 0 < Acceptance(Duty(), None, lambda: NOW).accept(KEY, data, sender).within <= 5
+            assert (
+                0
+                < Acceptance(SendPermit(), None, lambda: NOW).accept(KEY, data, sender).within
+                <= 5
+            )
 
     LOOP.run_until_complete(accepted())
 

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.contract.past.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Now, Step, buckets
-from gateway.contract.past.question import Question, question
+from gateway.contract.past.history_query import HistoryQuery, question
 from gateway.contract.past.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import BadValue, Damaged
-from gateway.parts.history.answers.course import DAMAGED, Course
+from gateway.parts.history.answers.bucket_search import DAMAGED, BucketSearch
 from gateway.parts.history.answers.recent import Recent
 from gateway.parts.history.answers.search import Search
 from gateway.parts.history.store.damage import Damage
@@ -199,7 +199,7 @@ def samples(count: int, seed: int) -> list[Sample]:
 
 
 @contextmanager
-def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[Course, Search]]:
+def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[BucketSearch, Search]]:
     """A file with all runs but the last, which is in memory."""
     with closing(HistoryFile(path, 10**8)) as file:
         for run in runs[:-1]:
@@ -210,7 +210,7 @@ def filed(path: Path, runs: Sequence[Sequence[Sample]]) -> Iterator[tuple[Course
         recent.add(runs[-1])
         reader = Reader(path)
         try:
-            yield Course(recent, reader, Damage()), Search(recent, reader, Damage())
+            yield BucketSearch(recent, reader, Damage()), Search(recent, reader, Damage())
         finally:
             reader.renew()
 
@@ -250,7 +250,7 @@ def at(seconds: float) -> int:
     return NOON + int(seconds * SECOND)
 
 
-def drawn(course: Course, first: float, last: float, now: Now) -> list[tuple[str, float]]:
+def drawn(course: BucketSearch, first: float, last: float, now: Now) -> list[tuple[str, float]]:
     """Returns quality and known seconds of buckets of ten seconds."""
     period = TimeRange(at(first), at(last) - 1)
     found = course.buckets(SPEED, period, 10 * SECOND, now, nothing)
@@ -320,12 +320,12 @@ def test_only_good_newest_samples(tmp_path: Path) -> None:
 # -- parameters ----------------------------------------------------------------------------------
 
 
-def asked(text: str) -> Question:
+def asked(text: str) -> HistoryQuery:
     return question(dict(part.split("=", 1) for part in text.split(";")))
 
 
 def test_parameters() -> None:
-    assert asked("_time=[..];bucket=1min;agg=last,min") == Question(
+    assert asked("_time=[..];bucket=1min;agg=last,min") == HistoryQuery(
         "[..]", MINUTE, ("min", "last"), None
     )
     assert [
@@ -336,8 +336,8 @@ def test_parameters() -> None:
         5400 * SECOND,
         2 * 86400 * SECOND,
     ]
-    assert asked("last=100;quality=good") == Question("[..]", last=100, only_good=True)
-    assert asked("_time=[..];limit=5;x=1;_y=2") == Question("[..]")
+    assert asked("last=100;quality=good") == HistoryQuery("[..]", last=100, only_good=True)
+    assert asked("_time=[..];limit=5;x=1;_y=2") == HistoryQuery("[..]")
 
 
 @pytest.mark.parametrize(

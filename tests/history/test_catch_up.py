@@ -15,7 +15,7 @@ from gateway.config import ZenohConfig, ZenohMode
 from gateway.contract import payload
 from gateway.contract.interfaces import History
 from gateway.contract.past.buckets import Bucket, Now
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.contract.payload import WriteOutcome
 from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import CommandResult
@@ -123,12 +123,12 @@ class SlowHistory:
         return self._answer(time_range, now, [good(tag, 1, PAST)])
 
     def buckets(
-        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: Now, pause: Callable[[], None]
     ) -> Iterator[Bucket]:
         raise NotImplementedError
 
     def newest(
-        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: int, pause: Callable[[], None]
     ) -> Iterator[Sample]:
         return self._answer(question.time_range, now, [good(tag, 1, PAST)])
 

@@ -15,7 +15,7 @@ from gateway.errors import BadValue, Busy
 from gateway.parts.history.answers.recent import Recent
 from gateway.parts.history.historian import Historian
 from gateway.parts.history.store.reader import Reader
-from gateway.parts.history.store.rows import Row
+from gateway.parts.history.store.rows import StoredRow
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, bad, good
 from gateway.values import Layout, Value, parse_type
@@ -207,13 +207,13 @@ def test_an_answer_begins_with_the_oldest_sample_that_is_left(
 ) -> None:
     at_once = Reader.rows
 
-    def late(reader: Reader, *arguments: Any) -> tuple[list[Row], bool] | None:
+    def late(reader: Reader, *arguments: Any) -> tuple[list[StoredRow], bool] | None:
         monkeypatch.undo()
         first = oldest_in_file(path)
         for start in range(20_000, 60_000, 1000):
             if oldest_in_file(path) == first:
                 flooded(historian, start, start + 1000)
-        rows: tuple[list[Row], bool] | None = at_once(reader, *arguments)
+        rows: tuple[list[StoredRow], bool] | None = at_once(reader, *arguments)
         return rows
 
     path = tmp_path / "h.db"

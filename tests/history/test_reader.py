@@ -15,7 +15,7 @@ from gateway.errors import Busy
 from gateway.parts.history.answers.outcomes import Outcome, Ring
 from gateway.parts.history.answers.recent import Identity
 from gateway.parts.history.store.file import HistoryFile
-from gateway.parts.history.store.reader import Part, Reader, in_order
+from gateway.parts.history.store.reader import Reader, SampleSource, in_order
 from gateway.tags import Sample, good
 from tests.history.recorded import (
     DOOR,
@@ -38,7 +38,7 @@ def test_overlapping_parts_are_merged_by_time(times: list[list[int]]) -> None:
         sorted((good(SPEED, n, t) for t in run), key=lambda s: s.time)
         for n, run in enumerate(times)
     ]
-    parts = [Part(run[0].time if run else 0, partial(iter, run)) for run in runs]
+    parts = [SampleSource(run[0].time if run else 0, partial(iter, run)) for run in runs]
     expected = sorted((sample for run in runs for sample in run), key=lambda s: (s.time, s.value))
     assert list(in_order(parts)) == expected
 
@@ -46,12 +46,12 @@ def test_overlapping_parts_are_merged_by_time(times: list[list[int]]) -> None:
 def test_a_part_is_read_only_when_its_time_comes() -> None:
     read: list[int] = []
 
-    def part(first: int) -> Part:
+    def part(first: int) -> SampleSource:
         def samples() -> list[Sample]:
             read.append(first)
             return [good(SPEED, first, first)]
 
-        return Part(first, samples)
+        return SampleSource(first, samples)
 
     answers = in_order([part(first) for first in range(100)])
     assert [next(answers).value for _ in range(3)] == [0, 1, 2]

@@ -11,8 +11,8 @@ from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from gateway.config import built
 from gateway.parts.serving.served_line import ServedLine
-from gateway.stations.served.registers import Row
-from gateway.stations.served.station import Station
+from gateway.stations.served.registers import ServedTag
+from gateway.stations.served.station import ServedStation
 from gateway.tags import Sample, good
 from tests.conftest import needs
 from tests.interop.peers import finished, free_port, pty_pair
@@ -35,7 +35,7 @@ class Plant:
     def samples(self, samples: Sequence[Sample]) -> None:
         self.given += samples
 
-    def online(self, device: Station, online: bool) -> None: ...
+    def online(self, device: ServedStation, online: bool) -> None: ...
 
     def written(self, name: str) -> list[object]:
         return [sample.value for sample in self.given if sample.tag.name == name]
@@ -51,7 +51,7 @@ async def serving(port: str, protocol: str) -> AsyncIterator[Plant]:
     [config] = built({"lines": {"panel": served}}).lines
     plant = Plant()
 
-    def sample_of(row: Row) -> Sample:
+    def sample_of(row: ServedTag) -> Sample:
         return good(row.tag, 70000, 0)
 
     line = ServedLine(config, plant, sample_of)

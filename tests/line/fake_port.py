@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from gateway.line.channel import Channel, Echo
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
@@ -56,7 +56,7 @@ def opened(
     echo: bool = False,
     needs_resync: bool = False,
     unmatched: list[Any] | None = None,
-    duty: Duty | None = None,
+    duty: SendPermit | None = None,
 ) -> Transaction:
     """A transaction on the port. `unmatched` collects the frames that are no reply."""
     driver = driver or Vigor(station=1)
@@ -65,7 +65,7 @@ def opened(
     device = made_device("plc", driver, wire, timing, ())
     if not needs_resync:
         device.health.answered()
-    may_not_send = (duty or Duty()).why_not
+    may_not_send = (duty or SendPermit()).why_not
     channel = Channel(port, wire, WireLog(), Echo("test", echo), may_not_send=may_not_send)
     channel.quiet_since = quiet_since
     frames = [] if unmatched is None else unmatched

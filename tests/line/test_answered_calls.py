@@ -10,7 +10,7 @@ from gateway.config import LineConfig, built
 from gateway.errors import LineDown
 from gateway.parts.serving.part import served_documents
 from gateway.parts.serving.served_line import ServedLine
-from gateway.stations.served.station import Station
+from gateway.stations.served.station import ServedStation
 from gateway.tags import Quality, Sample
 from gateway.transport import ModemAddress, Port, PortAddress, Receiver, SerialSettings, open_modem
 from tests.line.telephone import Cable, now
@@ -87,7 +87,7 @@ class Caller:
     def samples(self, samples: Sequence[Sample]) -> None:
         self.now += samples
 
-    def online(self, device: Station, online: bool) -> None:
+    def online(self, device: ServedStation, online: bool) -> None:
         self.present.append(online)
 
 

@@ -9,7 +9,7 @@ from gateway.engine.jobs.requests import Write
 from gateway.errors import Busy
 from gateway.line.arrival import HELD, PERIOD, ArrivalClock
 from gateway.line.perform import perform
-from gateway.line.send_permit import PROOF_VALID, SETTLE, Duty
+from gateway.line.send_permit import PROOF_VALID, SETTLE, SendPermit
 from gateway.tags import WriteResult, WriteRule
 from tests.line.fake_port import FakePort, opened
 from tests.sim.plant import device, make_tag, plant, running
@@ -17,15 +17,15 @@ from tests.sim.virtual import on_virtual_time
 
 
 def test_what_arrived_before_a_hold_or_soon_after_it_is_of_the_past() -> None:
-    duty = Duty(lambda: 100.0)
+    duty = SendPermit(lambda: 100.0)
     for since, now in ((95.0, 100.0), (100.0, 100.0), (100.9 * SETTLE, 103.0)):
         assert "stood still" in duty.why_not(since, now)
     assert duty.why_not(100.0 + SETTLE, 102.0) == ""
-    assert Duty().why_not(0.0, 0.0) == ""
+    assert SendPermit().why_not(0.0, 0.0) == ""
 
 
 def test_a_shared_duty_counts_while_it_is_proven() -> None:
-    duty = Duty(shared=True)
+    duty = SendPermit(shared=True)
     assert "may be active" in duty.why_not(5.0, 5.0)
     duty.prove(5.0)
     assert duty.why_not(5.0, 5.0 + PROOF_VALID) == ""
@@ -60,7 +60,7 @@ async def test_a_hold_in_the_middle_of_a_transaction_keeps_the_write_off_the_wir
     dev, port = device([tag]), FakePort()
     now = asyncio.get_running_loop().time()
     quiet_since = 0.0 if bit else now + 0.2  # the line must be silent first
-    talk = opened(port, quiet_since=quiet_since, duty=Duty(lambda: held[0]))
+    talk = opened(port, quiet_since=quiet_since, duty=SendPermit(lambda: held[0]))
     write = Write(dev, tag, [1], now)
     writing = asyncio.create_task(perform(write, talk))
     await asyncio.sleep(0.05)
@@ -76,7 +76,7 @@ async def test_a_write_that_was_not_sent_is_busy_and_the_line_goes_on() -> None:
     held = [-1e9]
     tag = make_tag("D0", write=WriteRule())
     dev = device([tag])
-    line = plant([dev], duty=Duty(lambda: held[0]))
+    line = plant([dev], duty=SendPermit(lambda: held[0]))
     async with running(line):
         await asyncio.sleep(1)
         outcome = line.submit(dev, tag, 5)

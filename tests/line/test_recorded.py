@@ -12,7 +12,7 @@ from gateway.protocols.driver import Span
 from gateway.protocols.listening import Listenable
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.port import open_simulator
-from gateway.simulator.recorded import Answered, Change, Course, RecordedStation
+from gateway.simulator.recorded import Answered, Change, RecordedStation, RecordedValues
 from gateway.tags import Quality, Reason, Sample
 from tests.line.test_replay import EXAMPLE, recorded
 from tests.sim.virtual import on_virtual_time
@@ -122,7 +122,7 @@ async def test_a_station_that_the_recording_does_not_hold_is_silent_and_counted(
 
 def test_a_value_comes_at_its_time_and_the_last_one_stays() -> None:
     driver = Vigor(station=0)
-    course = Course([Change(100.0, ("D", 1), 1), Change(101.0, ("D", 1), 2)])
+    course = RecordedValues([Change(100.0, ("D", 1), 1), Change(101.0, ("D", 1), 2)])
     station = RecordedStation(driver, course, 90.0, Answered())
     found = []
     for now in (0.0, 5.0, 10.0, 10.9, 11.0, 99.0):

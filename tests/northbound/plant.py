@@ -12,7 +12,7 @@ from gateway.config import ZenohConfig
 from gateway.contract.interfaces import History
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError, NotSent
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
 from gateway.parts.alarms.part import AlarmPart
@@ -52,7 +52,7 @@ class PlainPlant:
     command ends with `command_result`."""
 
     def __init__(self, *devices: PlainDevice) -> None:
-        self.duty = Duty()
+        self.duty = SendPermit()
         self._devices = devices
         self._tags = {tag.key: tag for device in devices for tag in device.tags}
         self.doors, self.lines = Doors(), ()

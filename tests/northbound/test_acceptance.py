@@ -8,7 +8,7 @@ import pytest
 
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import Busy
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 
 NOW = 1_790_000_000  # seconds since 1970
@@ -21,8 +21,8 @@ async def within(acceptance: Acceptance, waited: float, attachment: bytes | None
     return accepted.within
 
 
-def open_to_all(duty: Duty | None = None) -> Acceptance:
-    return Acceptance(duty or Duty(), None, lambda: NOW * 10**9)
+def open_to_all(duty: SendPermit | None = None) -> Acceptance:
+    return Acceptance(duty or SendPermit(), None, lambda: NOW * 10**9)
 
 
 def made(seconds_ago: float) -> bytes:
@@ -50,6 +50,6 @@ async def test_an_attachment_without_a_time_says_nothing(attachment: bytes) -> N
 
 async def test_what_waited_while_the_process_was_held_is_refused() -> None:
     released = time.monotonic()
-    acceptance = open_to_all(Duty(lambda: released))
+    acceptance = open_to_all(SendPermit(lambda: released))
     with pytest.raises(Busy, match="stood still"):
         await within(acceptance, 3.0)

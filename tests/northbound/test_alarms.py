@@ -12,7 +12,7 @@ from gateway.contract.access.signatures import sign
 from gateway.contract.access.writers import Writers
 from gateway.contract.keys import Family, Keys, parse_key, part_of
 from gateway.contract.problems import Failure
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.commands import Orders
@@ -35,7 +35,7 @@ class Desk:
         self.plant = PlainPlant(PlainDevice("mixer", (SPEED,)))
         self.audited: list[dict[str, Any]] = []
         audit = Audit(lambda data: self.audited.append(json.loads(data)))
-        acceptance = Acceptance(Duty(), writers)
+        acceptance = Acceptance(SendPermit(), writers)
         self._desk = Orders(KEYS, self.plant.parts, audit, acceptance)
 
     def take(self, value: float) -> None:

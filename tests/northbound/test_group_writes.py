@@ -12,7 +12,7 @@ from gateway.contract.parsing import LARGEST_GROUP, parse_group
 from gateway.contract.payload import GroupResult, WriteOutcome
 from gateway.contract.problems import Failure, Problem
 from gateway.errors import BadValue, Busy, NoReply, Refused
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests import writes
 from gateway.northbound.requests.acceptance import Acceptance, Sender
@@ -36,7 +36,7 @@ class Rig:
         self.plant = plant
         self.audit: list[WriteOutcome] = []
         index = TagIndex(keys, plant.devices())
-        accepts = Acceptance(Duty(), None)
+        accepts = Acceptance(SendPermit(), None)
         self.writes = Writes(plant, index, self.audit.append, accepts)
 
     def write(self, data: object, *, arrived: float | None = None) -> GroupResult | Failure:

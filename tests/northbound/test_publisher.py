@@ -13,8 +13,8 @@ from typing import Any
 import zenoh
 
 from gateway.contract.keys import Keys
-from gateway.northbound.publishing.losses import Losses
 from gateway.northbound.publishing.publisher import EVENTS_LIMIT, Publisher
+from gateway.northbound.publishing.slow_puts import SlowPuts
 from tests.e2e.processes import slowed
 from tests.northbound.plant import (
     PlainDevice,
@@ -82,7 +82,7 @@ class StuckSession:
 async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order() -> None:
     plant = mixer()
     session: Any = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"), Losses(1.0))
+    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
     publisher.start(session)
     publisher.values([plant.now("mixer/speed", 0)])
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
@@ -108,7 +108,7 @@ async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order(
 async def test_outcomes_and_alarms_go_before_values_and_documents_that_wait() -> None:
     plant = mixer()
     keys, session = Keys("plant", "demo"), StuckSession()
-    publisher = Publisher(keys, Losses(1.0))
+    publisher = Publisher(keys, SlowPuts(1.0))
     publisher.start(session)  # type: ignore[arg-type]
     publisher.values([plant.now("mixer/speed", 0)])
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
@@ -128,7 +128,7 @@ async def test_outcomes_and_alarms_go_before_values_and_documents_that_wait() ->
 
 async def test_outcomes_beyond_the_limit_are_dropped_and_counted() -> None:
     keys, session = Keys("plant", "demo"), StuckSession()
-    publisher = Publisher(keys, Losses(1.0))
+    publisher = Publisher(keys, SlowPuts(1.0))
     publisher.start(session)  # type: ignore[arg-type]
     publisher.values([mixer().now("mixer/recipe", 0)])
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
@@ -143,7 +143,7 @@ async def test_outcomes_beyond_the_limit_are_dropped_and_counted() -> None:
 async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
     plant = mixer()
     session: Any = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"), Losses(1.0))
+    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
     publisher.events([plant.now("mixer/speed", 0)])  # no session yet
     publisher.start(session)
     publisher.values([plant.now("mixer/recipe", 0)])

@@ -11,8 +11,8 @@ import pytest
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.contract.keys import Keys
 from gateway.northbound.answering.tag_index import TagIndex
-from gateway.northbound.publishing.losses import Losses
 from gateway.northbound.publishing.republish import Republisher
+from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.tags import Reason, Sample, bad
 from tests.northbound.plant import (
@@ -54,7 +54,7 @@ async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
     plant = PlainPlant(PlainDevice("reader", (code, weight)))
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     published: list[Sample] = []
-    losses = Losses(1.0)
+    losses = SlowPuts(1.0)
     republisher = Republisher(published.extend, plant, index, LinkMonitor(), losses, 600.0, nothing)
     await republisher.publish_all()  # as at a start
     assert published == [bad(of, Reason.STARTING, plant.sample(of).time) for of in (code, weight)]
@@ -78,7 +78,7 @@ async def test_the_plant_marks_republished_samples_before_they_go_out() -> None:
 
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     await Republisher(
-        publish, plant, index, LinkMonitor(), Losses(1.0), 600.0, nothing
+        publish, plant, index, LinkMonitor(), SlowPuts(1.0), 600.0, nothing
     ).publish_all()
     assert len(published) == 4
 
@@ -132,7 +132,7 @@ async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> N
 
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
     index = TagIndex(Keys("plant", "demo"), plant.devices())
-    settings = {"links": LinkMonitor(), "losses": Losses(0.05), "refresh": 1e6, **how}
+    settings = {"links": LinkMonitor(), "losses": SlowPuts(0.05), "refresh": 1e6, **how}
     return Republisher(published.extend, plant, index, parts=nothing, **settings)
 
 
@@ -145,7 +145,7 @@ def of_mixer(count: int) -> PlainPlant:
 
 @on_virtual_time
 async def test_values_that_a_full_link_may_have_dropped_are_published_again() -> None:
-    plant, published, losses = of_mixer(1000), list[Sample](), Losses(0.05)
+    plant, published, losses = of_mixer(1000), list[Sample](), SlowPuts(0.05)
     current = list(plant.samples.values())
     losses.sent(current[:300], 0.05, now())
     task = asyncio.create_task(republisher(plant, published, losses=losses).run())
@@ -156,7 +156,7 @@ async def test_values_that_a_full_link_may_have_dropped_are_published_again() ->
 
 @on_virtual_time
 async def test_a_round_ends_when_the_link_is_full_again() -> None:
-    plant, losses = of_mixer(1000), Losses(0.05)
+    plant, losses = of_mixer(1000), SlowPuts(0.05)
     published: list[Sample] = []
 
     def publish(samples: Sequence[Sample]) -> None:

@@ -6,8 +6,8 @@ import time
 from collections.abc import Mapping
 
 from gateway.contract.keys import Keys
-from gateway.northbound.publishing.losses import Losses
 from gateway.northbound.publishing.publisher import Publisher
+from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.northbound.publishing.status_publisher import StatusPublisher
 from gateway.northbound.requests.audit import Audit
 
@@ -30,7 +30,7 @@ class Plant:
 
 
 def published(plant: Plant) -> StatusPublisher:
-    publisher = Publisher(KEYS, Losses(0.05))
+    publisher = Publisher(KEYS, SlowPuts(0.05))
     return StatusPublisher(KEYS, plant.collect, publisher, Audit(lambda _: None), 5.0)
 
 

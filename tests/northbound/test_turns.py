@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from gateway.northbound.answering.turns import Pause, Rank, Turns
+from gateway.northbound.answering.turns import AnswerTurns, Pause, Rank
 
 PATIENCE = 300.0  # seconds; never waited for when all is well
 
@@ -22,7 +22,7 @@ class Clock:
 class Answer:
     """An answer on a thread of its own, which works step by step."""
 
-    def __init__(self, turns: Turns, rank: Rank, worked: Callable[[], None]) -> None:
+    def __init__(self, turns: AnswerTurns, rank: Rank, worked: Callable[[], None]) -> None:
         self._turn: AbstractContextManager[Pause] = turns.turn(rank)
         self._worked = worked
         self.has_turn = threading.Event()
@@ -44,7 +44,7 @@ class Answer:
         assert not self._thread.is_alive()
 
 
-def waiting(turns: Turns, count: int) -> None:
+def waiting(turns: AnswerTurns, count: int) -> None:
     """Waits until so many answers wait for a turn."""
     while sum(map(len, turns._waiting.values())) < count:  # no answer tells that it waits
         threading.Event().wait(0.001)
@@ -52,7 +52,7 @@ def waiting(turns: Turns, count: int) -> None:
 
 def test_current_values_go_before_history() -> None:
     clock, order = Clock(), list[str]()
-    turns = Turns(clock)
+    turns = AnswerTurns(clock)
     first = Answer(turns, Rank.HISTORY, lambda: order.append("first"))
     assert first.has_turn.wait(PATIENCE)
     history = Answer(turns, Rank.HISTORY, lambda: order.append("history"))
@@ -70,7 +70,7 @@ def test_current_values_go_before_history() -> None:
 
 def test_history_does_not_get_every_second_slice() -> None:
     clock, order = Clock(), list[str]()
-    turns = Turns(clock)
+    turns = AnswerTurns(clock)
     current = Answer(turns, Rank.CURRENT, lambda: order.append("current"))
     assert current.has_turn.wait(PATIENCE)
     history = Answer(turns, Rank.HISTORY, lambda: order.append("history"))
@@ -84,7 +84,7 @@ def test_history_does_not_get_every_second_slice() -> None:
 
 def test_an_answer_that_waits_for_its_client_keeps_nobody_else_waiting() -> None:
     clock, order = Clock(), list[str]()
-    turns = Turns(clock)
+    turns = AnswerTurns(clock)
     blocked = Answer(turns, Rank.CURRENT, lambda: order.append("blocked"))
     assert blocked.has_turn.wait(PATIENCE)
     clock.now = 1.0
@@ -96,7 +96,7 @@ def test_an_answer_that_waits_for_its_client_keeps_nobody_else_waiting() -> None
 
 
 def test_history_gets_a_share_beside_many_current_values() -> None:
-    turns = Turns(Clock())
+    turns = AnswerTurns(Clock())
     with turns.turn(Rank.CURRENT):
         order = list[Rank]()
         lock = threading.Lock()

@@ -21,7 +21,7 @@ from gateway.contract.access.writers import (
     Writers,
 )
 from gateway.contract.past.buckets import Bucket, Now
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.errors import ConfigError, NotAllowed, Repeated
 from gateway.northbound.northbound import Files
 from gateway.northbound.requests.acceptance import AcceptedUntil
@@ -47,12 +47,12 @@ class RecordedWrites:
         raise NotImplementedError
 
     def buckets(
-        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: Now, pause: Callable[[], None]
     ) -> Iterator[Bucket]:
         raise NotImplementedError
 
     def newest(
-        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: int, pause: Callable[[], None]
     ) -> Iterator[Sample]:
         raise NotImplementedError
 

@@ -16,7 +16,7 @@ from gateway.errors import (
     NoReply,
     Refused,
 )
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests import inbox
 from gateway.northbound.requests.acceptance import Acceptance, Sender
@@ -215,7 +215,7 @@ async def test_a_write_may_wait_for_a_telephone_call(dial: float) -> None:
     plant = mixer()
     plant.dial = dial
     index = TagIndex(Keys("plant", "demo"), plant.devices())
-    writes = Writes(plant, index, lambda _: None, Acceptance(Duty(), None))
+    writes = Writes(plant, index, lambda _: None, Acceptance(SendPermit(), None))
     arrived = asyncio.get_running_loop().time()
     await writes.write("plant/mixer/recipe/@set", b"7", Sender(arrived=arrived))
     assert plant.written == [("mixer/recipe", 7)]

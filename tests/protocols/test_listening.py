@@ -9,9 +9,17 @@ from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import Ack, Enquiry, Frame, LinkCodec, Text
 from gateway.protocols.driver import Span
-from gateway.protocols.listening import Asked, Ear, Heard, Listenable, Noise, Pairing, Told
+from gateway.protocols.listening import (
+    Asked,
+    Heard,
+    Listenable,
+    Noise,
+    Pairing,
+    Told,
+    TrafficReader,
+)
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
-from gateway.protocols.modbus.ear import RtuEar
+from gateway.protocols.modbus.traffic import RtuTrafficReader
 from gateway.protocols.vigor import Vigor
 from tests.doubles import octets
 from tests.vectors import vectors
@@ -129,12 +137,12 @@ def test_a_broadcast_waits_for_no_reply() -> None:
 # Frames
 
 
-def chopped(ear: Callable[[], Ear], frames: Sequence[bytes]) -> list[list[Heard]]:
+def chopped(new: Callable[[], TrafficReader], frames: Sequence[bytes]) -> list[list[Heard]]:
     """Returns what the frames mean, in pieces of one byte, of three, and all at once."""
     whole = b"".join(frames)
     found = []
     for size in (1, 3, len(whole)):
-        reader, heard = ear(), list[Heard]()
+        reader, heard = new(), list[Heard]()
         for at in range(0, len(whole), size):
             heard += reader.feed(whole[at : at + size], 1.0 if at == 0 else 0.0)
         found.append(heard)
@@ -155,7 +163,7 @@ def test_modbus_rtu_in_any_pieces() -> None:
         rtu(3, 16, 0, 1, 0, 1),
         rtu(3, 0x2B, 0),  # an unknown function
     ]
-    for heard in chopped(lambda: RtuEar(CHARACTER), frames):
+    for heard in chopped(lambda: RtuTrafficReader(CHARACTER), frames):
         asked, told, written, done, *rest = heard
         assert isinstance(asked, Asked)
         assert isinstance(told, Told)
@@ -171,30 +179,30 @@ def test_modbus_rtu_in_any_pieces() -> None:
 
 def test_a_frame_of_modbus_rtu_begins_after_a_silence_or_a_whole_frame() -> None:
     request = rtu(1, 3, 0, 0, 0, 1)
-    ear = RtuEar(CHARACTER)
-    assert all(isinstance(one, Noise) for one in ear.feed(request[3:] + request, 1.0))
-    assert all(isinstance(one, Noise) for one in ear.feed(request, 0.001))  # no silence yet
-    assert isinstance(ear.feed(request, 0.0036)[-1], Asked)
-    assert isinstance(ear.feed(rtu(1, 3, 2, 0, 5), 0.0)[-1], Told)
+    reader = RtuTrafficReader(CHARACTER)
+    assert all(isinstance(one, Noise) for one in reader.feed(request[3:] + request, 1.0))
+    assert all(isinstance(one, Noise) for one in reader.feed(request, 0.001))  # no silence yet
+    assert isinstance(reader.feed(request, 0.0036)[-1], Asked)
+    assert isinstance(reader.feed(rtu(1, 3, 2, 0, 5), 0.0)[-1], Told)
     damaged = bytes((*request[:-1], request[-1] ^ 1))
-    [noise, again] = ear.feed(damaged, 0.01) + ear.feed(request, 0.25)
+    [noise, again] = reader.feed(damaged, 0.01) + reader.feed(request, 0.25)
     assert isinstance(noise, Noise)
     assert isinstance(again, Asked)
 
 
 def test_a_reply_with_24_bits_that_may_be_a_request_is_not_believed() -> None:
-    ear = RtuEar(CHARACTER)
-    ear.feed(rtu(1, 1, 0, 16, 0, 20), 1.0)
-    [heard] = ear.feed(rtu(1, 1, 3, 0xAA, 0, 16), 0.01)  # or: read 16 coils from 03AAh
+    reader = RtuTrafficReader(CHARACTER)
+    reader.feed(rtu(1, 1, 0, 16, 0, 20), 1.0)
+    [heard] = reader.feed(rtu(1, 1, 3, 0xAA, 0, 16), 0.01)  # or: read 16 coils from 03AAh
     assert isinstance(heard, Noise)
-    ear.feed(rtu(1, 1, 0, 16, 0, 20), 0.01)
-    [heard] = ear.feed(rtu(1, 1, 3, 0xAA, 0xFF, 0xF0), 0.01)  # no request has so many
+    reader.feed(rtu(1, 1, 0, 16, 0, 20), 0.01)
+    [heard] = reader.feed(rtu(1, 1, 3, 0xAA, 0xFF, 0xF0), 0.01)  # no request has so many
     assert isinstance(heard, Told)
 
 
 def test_modbus_ascii_in_any_pieces() -> None:
     frames = [b":010300000001FB\r\n", b":0103020005F5\r\n", b"xx", b":010300000001FC\r\n"]
-    for heard in chopped(lambda: ModbusAscii(station=1).ear(CHARACTER), frames):
+    for heard in chopped(lambda: ModbusAscii(station=1).traffic_reader(CHARACTER), frames):
         asked, told, *rest = heard
         assert isinstance(asked, Asked)
         assert isinstance(told, Told)
@@ -212,7 +220,7 @@ def test_vigor_in_any_pieces() -> None:
     assert reply in known.values()
     driver = Vigor(station=0)
     for heard in chopped(
-        lambda: driver.ear(CHARACTER), [b"\x00", request, reply, reply[:-1] + b"x"]
+        lambda: driver.traffic_reader(CHARACTER), [b"\x00", request, reply, reply[:-1] + b"x"]
     ):
         noise, asked, told, damaged = heard[0], heard[1], heard[2], heard[3:]
         assert isinstance(noise, Noise)
@@ -240,7 +248,9 @@ def test_computer_link_in_any_pieces(frame_format: int, sum_check: bool) -> None
         Enquiry(5, "WW", "D0100010001"),
         Ack(5),
     ]
-    for heard in chopped(lambda: driver.ear(CHARACTER), [codec.encode(one) for one in frames]):
+    for heard in chopped(
+        lambda: driver.traffic_reader(CHARACTER), [codec.encode(one) for one in frames]
+    ):
         kinds = [type(one) for one in heard]
         assert kinds == [Asked, Told, Asked, Told, Asked, Told]
         words, data, bits, states, write, _ = heard
@@ -264,7 +274,7 @@ def test_words_over_bits_of_the_computer_link() -> None:
 
 
 def _read(command: str, area: str) -> Any:
-    ear = ComputerLink(station=0).ear(CHARACTER)
-    [asked] = ear.feed(LinkCodec().encode(Enquiry(0, command, area)), 1.0)
+    reader = ComputerLink(station=0).traffic_reader(CHARACTER)
+    [asked] = reader.feed(LinkCodec().encode(Enquiry(0, command, area)), 1.0)
     assert isinstance(asked, Asked)
     return asked.read

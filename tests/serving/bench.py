@@ -8,8 +8,8 @@ from typing import Any
 from gateway.config import Config, built
 from gateway.parts.serving.served_line import ServedLine
 from gateway.stations.served.answering import Answerer, Heard
-from gateway.stations.served.registers import Row
-from gateway.stations.served.station import Station
+from gateway.stations.served.registers import ServedTag
+from gateway.stations.served.station import ServedStation
 from gateway.tags import Reason, Sample, Tag, bad, good
 from gateway.values import Value
 
@@ -48,10 +48,10 @@ class Bench:
     def samples(self, samples: Any) -> None:
         self.samples_given.append(list(samples))
 
-    def online(self, device: Station, online: bool) -> None:
+    def online(self, device: ServedStation, online: bool) -> None:
         self.online_given.append((device.name, online))
 
-    def _sample(self, row: Row) -> Sample | None:
+    def _sample(self, row: ServedTag) -> Sample | None:
         key = row.source or row.tag.key
         tag: Tag = self._tags[key]
         value = self.values.get(key)

@@ -16,12 +16,12 @@ from gateway.contract.keys import Keys
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.sharing.guest import MOST_WAITING, Guest
+from gateway.parts.sharing.guest_requests import GuestRequests
 from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.plan import door_plans, door_warnings
 from gateway.parts.sharing.settings import Sharing
 from gateway.parts.sharing.stores import Step
 from gateway.parts.sharing.tunnel import Tunnel
-from gateway.parts.sharing.turns import Turns
 from gateway.parts.transfers.forecast import forecasts
 from gateway.plant.plant import Plant
 from gateway.protocols.driver import Span
@@ -137,7 +137,7 @@ async def opened(settings: dict[str, Any], lines: Any = LINES) -> AsyncIterator[
     try:
         async with asyncio.TaskGroup() as tasks:
             [one] = sharing.doors
-            made = OpenDoor(one, Turns(plant.any_address, north), plant, tasks, keep)
+            made = OpenDoor(one, GuestRequests(plant.any_address, north), plant, tasks, keep)
             for line in plant.lines:
                 tasks.create_task(line.run())
             await asyncio.sleep(2)

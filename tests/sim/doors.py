@@ -21,10 +21,10 @@ from gateway.line.opening import OpenPort
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.sharing.guest import Guest
+from gateway.parts.sharing.guest_requests import GuestRequests
 from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.settings import Sharing
 from gateway.parts.sharing.tunnel import Tunnel
-from gateway.parts.sharing.turns import Turns
 from gateway.plant.plant import Plant
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.rtu import encode
@@ -234,7 +234,7 @@ class World:
 
     async def run(self, seconds: float) -> None:
         """Runs the programs for so long, while the wire has one fault after another."""
-        turns = Turns(self.plant.any_address, self)  # type: ignore[arg-type]
+        turns = GuestRequests(self.plant.any_address, self)  # type: ignore[arg-type]
         ends = now() + seconds
         async with asyncio.TaskGroup() as tasks:
             work = [tasks.create_task(line.run()) for line in self.plant.lines]

@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from gateway.engine.jobs.requests import WRITE_EXPIRY
-from gateway.northbound.publishing.losses import ROUNDS
+from gateway.northbound.publishing.slow_puts import ROUNDS
 from gateway.tags import Quality, Sample
 from tests.sim.north_peers import Client
 from tests.sim.story import Story

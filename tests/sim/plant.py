@@ -17,7 +17,7 @@ from gateway.engine.engine import Engine
 from gateway.engine.jobs import requests
 from gateway.errors import GatewayError
 from gateway.line.line import Line
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
 from gateway.protocols.vigor import Vigor
@@ -91,7 +91,7 @@ class Plant:
     now: dict[Tag, Sample] = field(default_factory=dict)
     echo_in_file: bool = True  # False: an adapter echoes, and the file does not mention it
     listeners: list[Callable[[Sequence[Sample]], None]] = field(default_factory=list)
-    duty: Duty | None = None
+    duty: SendPermit | None = None
     inherits: bool = False
     line: Line = field(init=False)
 
@@ -230,7 +230,7 @@ def plant(
     *,
     wire: WireTiming = WIRE,
     seed: int = 0,
-    duty: Duty | None = None,
+    duty: SendPermit | None = None,
     **bench: Any,
 ) -> Plant:
     """Makes a station for every device. The knobs of station and bench work at any time."""

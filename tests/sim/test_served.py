@@ -12,7 +12,7 @@ import pytest
 from gateway.config import built
 from gateway.parts.serving.served_line import ServedLine
 from gateway.protocols.checksums import crc16
-from gateway.stations.served.station import Station
+from gateway.stations.served.station import ServedStation
 from gateway.tags import Quality, Sample
 from gateway.transport import Port, Receiver
 
@@ -117,7 +117,7 @@ class Wire:
     def samples(self, samples: Sequence[Sample]) -> None:
         self.given += samples
 
-    def online(self, device: Station, online: bool) -> None: ...
+    def online(self, device: ServedStation, online: bool) -> None: ...
 
     async def send(self, data: bytes, draw: random.Random) -> None:
         """Sends with the time of the characters, in the pieces of an adapter."""

@@ -11,7 +11,7 @@ import pytest
 
 from gateway.contract.keys import Keys
 from gateway.errors import Busy, Unclear
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.transfers import Transfers
@@ -241,7 +241,7 @@ async def test_a_write_of_a_transfer_is_audited_by_its_name() -> None:
 
 async def test_a_gateway_that_may_not_be_the_active_one_carries_nothing() -> None:
     plant = mixer()
-    plant.duty = Duty(shared=True)
+    plant.duty = SendPermit(shared=True)
     tag = plant.tag("mixer/recipe")
     assert tag is not None
     writes, outcomes = own(plant)

@@ -9,4 +9,4 @@ from gateway.cli.client.arguments import (
 )
 from gateway.cli.client.client import Client
 from gateway.cli.client.connection import connected, reached
-from gateway.cli.client.rows import Row
+from gateway.cli.client.rows import TagRow

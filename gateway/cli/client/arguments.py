@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from gateway.config.address import Address
 from gateway.config.messages import similar
 from gateway.errors import ConfigError
 from gateway.values import Value
@@ -15,10 +14,11 @@ from gateway.values.numerals import parse_decimal
 
 if TYPE_CHECKING:
     from gateway.config import Config
+    from gateway.config.gateway_address import GatewayAddress
     from gateway.tags import Tag
 
 
-def tags_by_key(config: "Config | Address") -> "dict[str, Tag]":
+def tags_by_key(config: "Config | GatewayAddress") -> "dict[str, Tag]":
     """Returns all tags by `device/tag`."""
     return {tag.key: tag for device in config.devices for tag in device.tags}
 

@@ -12,16 +12,16 @@ import orjson
 import zenoh
 
 from gateway.cli.client.arguments import matches, tags_by_key
-from gateway.cli.client.rows import Row, document, raw, reason, without_gateway
+from gateway.cli.client.rows import TagRow, document, raw, reason, without_gateway
 from gateway.cli.client.tracing import traced
 from gateway.cli.client.value_pages import paged
-from gateway.config.address import Address
 from gateway.contract.keys import Keys
 from gateway.errors import GatewayError
 from gateway.values import Value
 
 if TYPE_CHECKING:
     from gateway.config import Config
+    from gateway.config.gateway_address import GatewayAddress
 
 REPLY_TIMEOUT = 10.0  # seconds
 _CHANGED = "does the gateway run with the current version of this file?"
@@ -38,7 +38,7 @@ class Client:
     def __init__(
         self,
         session: zenoh.Session,
-        config: "Config | Address",
+        config: "Config | GatewayAddress",
         tell: Callable[[str], None],
         user: str | None = None,
     ) -> None:
@@ -60,7 +60,7 @@ class Client:
         allowed = f", and may {self._user} query it" if self._user else ""
         return f"no reply: is the gateway of this file running{allowed}?"
 
-    def values(self, wanted: str, max_age: str | None = None) -> list[Row]:
+    def values(self, wanted: str, max_age: str | None = None) -> list[TagRow]:
         """Returns the current values of the tags that a key expression matches, by name.
 
         The key expression has no prefix. When two gateways reply for a device, the result has
@@ -77,7 +77,7 @@ class Client:
         self._report_duplicates(found)
         return found
 
-    def report_missing(self, wanted: list[str], rows: Sequence[Row]) -> bool:
+    def report_missing(self, wanted: list[str], rows: Sequence[TagRow]) -> bool:
         """Reports the wanted tags of the file without a row. Returns True when there are none."""
         found = {row.tag for row in rows}
         missing = [key for key in self._tags if key not in found and matches(key, wanted)]
@@ -174,14 +174,14 @@ class Client:
         """One description of a device: only its gateway replies."""
         return self._keys.meta(f"{device}/**") + "?page=1"
 
-    def follow(self, wanted: list[str]) -> Generator[Row, None, None]:
+    def follow(self, wanted: list[str]) -> Generator[TagRow, None, None]:
         """Yields the current values, then every change, without end.
 
         When the gateway ends, all values become bad: `no-gateway`. When it returns, or another
         member of its standby group becomes active, the client queries the values again. Raises
         `GatewayError` when no gateway replies at the start.
         """
-        news: SimpleQueue[Row | bool] = SimpleQueue()
+        news: SimpleQueue[TagRow | bool] = SimpleQueue()
         with ExitStack() as stack:
             for subscriber in self._subscribers(wanted, news.put):
                 stack.enter_context(subscriber)
@@ -197,7 +197,7 @@ class Client:
                 known.update(row.tag for row in rows)
                 yield from rows
                 event = news.get()
-                if present and isinstance(event, Row):
+                if present and isinstance(event, TagRow):
                     rows = [event]
                     continue
                 self._will_query = False
@@ -214,11 +214,11 @@ class Client:
                 known -= lost
                 yield from map(without_gateway, sorted(lost))
 
-    def _all(self, wanted: list[str]) -> list[Row]:
+    def _all(self, wanted: list[str]) -> list[TagRow]:
         return [row for key in wanted for row in self.values(key)]
 
     def _subscribers(
-        self, wanted: list[str], put: Callable[[Row], None]
+        self, wanted: list[str], put: Callable[[TagRow], None]
     ) -> Iterator[zenoh.Subscriber[None]]:
         """Yields subscribers to the values, and to the blocks of devices without single values."""
 
@@ -231,7 +231,7 @@ class Client:
             with suppress(orjson.JSONDecodeError):
                 for name, known in document(sample.payload.to_bytes()).items():
                     if name in tags and isinstance(known, dict):
-                        put(Row(tags[name], known))
+                        put(TagRow(tags[name], known))
 
         for key in wanted:
             yield self._session.declare_subscriber(self._keys.value(key), arrived)
@@ -324,16 +324,16 @@ class Client:
                         return document(answer.payload.to_bytes())
         raise GatewayError(f"{key}: no reply: it is unknown whether it was done")
 
-    def _row(self, sample: zenoh.Sample) -> Row | None:
+    def _row(self, sample: zenoh.Sample) -> TagRow | None:
         tag = self._tags.get(self._keys.tag(str(sample.key_expr)) or "")
         with suppress(orjson.JSONDecodeError):
             if tag is not None and sample.attachment is not None:
-                return Row(tag.key, raw(tag, sample, sample.attachment.to_bytes()))
+                return TagRow(tag.key, raw(tag, sample, sample.attachment.to_bytes()))
             if tag is not None and sample.kind == zenoh.SampleKind.PUT:
-                return Row(tag.key, document(sample.payload.to_bytes()))
+                return TagRow(tag.key, document(sample.payload.to_bytes()))
         return None
 
-    def _report_duplicates(self, rows: list[Row]) -> None:
+    def _report_duplicates(self, rows: list[TagRow]) -> None:
         """Reports each device with several gateways. `rows` are the sorted replies to one query."""
         duplicated = {
             self._tags[row.tag].device

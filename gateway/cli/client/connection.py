@@ -13,12 +13,13 @@ import zenoh
 from gateway import config as configuration
 from gateway.cli.client.client import Client
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.config.address import Address, address
+from gateway.config.gateway_address import address
 from gateway.errors import ConfigError, GatewayError
 from gateway.northbound.session.session_settings import configure, reachable
 
 if TYPE_CHECKING:
     from gateway.config import Config
+    from gateway.config.gateway_address import GatewayAddress
 
 USER_VARIABLE = "PLC_GATEWAY_CLI_USER"
 PASSWORD_VARIABLE = "PLC_GATEWAY_CLI_PASSWORD"  # noqa: S105  (the name of a variable)
@@ -48,7 +49,7 @@ def reached(path: Path, tell: Callable[[str], None]) -> Iterator[Client]:
 
 
 @contextmanager
-def connected(config: "Config | Address", tell: Callable[[str], None]) -> Iterator[Client]:
+def connected(config: "Config | GatewayAddress", tell: Callable[[str], None]) -> Iterator[Client]:
     """Yields a client of the gateway that `config` describes. `tell` gets sentences for people.
 
     The client uses the user of the environment variables, or else the gateway's own. Raises
@@ -73,7 +74,7 @@ def connected(config: "Config | Address", tell: Callable[[str], None]) -> Iterat
             session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
-def _endpoints(config: "Config | Address") -> tuple[str, ...]:
+def _endpoints(config: "Config | GatewayAddress") -> tuple[str, ...]:
     """Returns the endpoints to try, in order."""
     own = config.zenoh
     if own.mode == "client":

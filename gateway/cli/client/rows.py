@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from gateway.tags import Tag
 
 
-class Row(NamedTuple):
+class TagRow(NamedTuple):
     """A sample to print: `document` is the decoded payload."""
 
     tag: str  # device/name
     document: dict[str, object]
 
 
-def without_gateway(tag: str) -> Row:
+def without_gateway(tag: str) -> TagRow:
     """Returns the row of a tag after its gateway was lost."""
     from gateway.tags.timestamps import rfc3339  # with all about tags
 
     now = rfc3339(time.time_ns())
-    return Row(tag, {"value": None, "quality": "bad", "reason": "no-gateway", "time": now})
+    return TagRow(tag, {"value": None, "quality": "bad", "reason": "no-gateway", "time": now})
 
 
 def raw(tag: "Tag", sample: zenoh.Sample, about: bytes) -> dict[str, object]:

@@ -9,7 +9,7 @@ from rich.text import Text
 from gateway.config import LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.protocols.driver import Address, Span
-from gateway.stations.served.registers import Row, Served
+from gateway.stations.served.registers import Served, ServedTag
 
 
 def served_plan(line: LineConfig) -> RenderableType:
@@ -29,7 +29,7 @@ def served_plan(line: LineConfig) -> RenderableType:
     return Group(Text(head), table, Text())
 
 
-def _cells(row: Row) -> Iterator[str]:
+def _cells(row: ServedTag) -> Iterator[str]:
     tag = row.tag
     yield tag.text
     yield str(tag.layout.type)

@@ -13,10 +13,10 @@ from gateway.cli.history.history_files import Column, new_file, write_csv, write
 from gateway.cli.terminal import ConfigPath, TagNames, err
 from gateway.config import Config, load
 from gateway.contract.past.buckets import Now
-from gateway.contract.past.question import Question, question
+from gateway.contract.past.history_query import HistoryQuery, question
 from gateway.contract.past.timerange import TimeRange, time_range
 from gateway.errors import Damaged, GatewayError
-from gateway.parts.history.answers.course import Course
+from gateway.parts.history.answers.bucket_search import BucketSearch
 from gateway.parts.history.answers.search import Search
 from gateway.parts.history.files.aside import asides, rename
 from gateway.parts.history.files.offline import backup as copied
@@ -129,7 +129,7 @@ def backup(
 def _samples(
     search: Search,
     tags: Mapping[str, Tag],
-    asked: Question,
+    asked: HistoryQuery,
     period: TimeRange,
     now: int,
     lost: list[Damaged],
@@ -155,9 +155,9 @@ def _row(sample: Sample) -> tuple[Any, ...]:
 
 
 def _buckets(
-    course: Course,
+    course: BucketSearch,
     tags: Mapping[str, Tag],
-    asked: Question,
+    asked: HistoryQuery,
     period: TimeRange,
     now: int,
     lost: list[Damaged],
@@ -185,7 +185,7 @@ def _buckets(
             lost.append(error)
 
 
-def _bucket_columns(asked: Question) -> list[Column]:
+def _bucket_columns(asked: HistoryQuery) -> list[Column]:
     return [
         Column("time", "time"),
         Column("tag", "word"),

@@ -13,7 +13,7 @@ from typing import Self
 from gateway import files
 from gateway.config import LineConfig
 from gateway.errors import GatewayError
-from gateway.protocols.listening import Asked, Ear, Listenable
+from gateway.protocols.listening import Asked, Listenable, TrafficReader
 
 _RAW_IP, _UPPER_PDU = 101, 252  # link types
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
@@ -38,8 +38,14 @@ class Capture:
         self._dissector = (named[0] if named else "data").encode()
         self._is_tcp = any(one.traits.over_network for one in drivers)
         self._sent = {_MASTER: 1, _STATION: 1}  # the sequence numbers of TCP
-        ears = [one.ear(line.wire.character) for one in drivers if isinstance(one, Listenable)]
-        self._ear: Ear | None = ears[0] if ears else None  # finds the ends of the frames
+        readers = [
+            one.traffic_reader(line.wire.character)
+            for one in drivers
+            if isinstance(one, Listenable)
+        ]
+        self._traffic_reader: TrafficReader | None = (
+            readers[0] if readers else None
+        )  # finds the ends of the frames
         self._path = path
         self._pending = b""  # received, and no whole frame yet
         self._begun = self._last = 0.0
@@ -65,7 +71,7 @@ class Capture:
         silence, self._last = at - self._last, at
         if way == ">" or silence > _PAUSE:
             self._flush()
-        heard = [] if self._ear is None else self._ear.feed(data, silence)
+        heard = [] if self._traffic_reader is None else self._traffic_reader.feed(data, silence)
         if way == ">":
             self._packet(at, data, asks=True, sent=True)
             return

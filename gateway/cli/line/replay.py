@@ -23,7 +23,7 @@ from gateway.line.exchanges import shown
 from gateway.parts.recording.replay import Difference, Learned, Replay, courses, of_units, timed
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
 from gateway.protocols.listening import Listenable
-from gateway.simulator.recorded import Answered, Course, OtherStations, RecordedStation
+from gateway.simulator.recorded import Answered, OtherStations, RecordedStation, RecordedValues
 from gateway.simulator.serve import serve_on_pty, serve_on_tcp
 from gateway.stations.station import Station
 
@@ -150,12 +150,12 @@ def serve(line: LineConfig, log: Sequence[LoggedPiece], tcp: str | None) -> None
 
 
 def stations_of(
-    line: LineConfig, found: Mapping[str, Course], begin: float, answered: Answered
+    line: LineConfig, found: Mapping[str, RecordedValues], begin: float, answered: Answered
 ) -> list[Station]:
     """Returns the simulated PLCs of a line of units. `begin`: time of the first byte."""
     drivers = [device.driver for device in line.devices]
-    ears = [driver for driver in drivers if isinstance(driver, Listenable)]
-    others = OtherStations(ears, {driver.station for driver in drivers}, answered)
+    readers = [driver for driver in drivers if isinstance(driver, Listenable)]
+    others = OtherStations(readers, {driver.station for driver in drivers}, answered)
     recorded = [
         RecordedStation(device.driver, found[device.name], begin, answered)
         for device in line.devices
@@ -165,7 +165,7 @@ def stations_of(
 
 async def _serve(
     line: LineConfig,
-    found: Mapping[str, Course],
+    found: Mapping[str, RecordedValues],
     begin: float,
     tcp: str | None,
     answered: Answered,

@@ -13,7 +13,7 @@ from gateway.config.settings.records import LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Cost, Span, Timing, Traits
-from gateway.stations.served.registers import STALE_AFTER, Row, Served, cells_of
+from gateway.stations.served.registers import STALE_AFTER, Served, ServedTag, cells_of
 from gateway.stations.served.registry import can_serve, common_settings, served_protocols
 from gateway.tags import Publish, Tag
 from gateway.transport.port import SimulatorAddress
@@ -126,7 +126,7 @@ class ServedDevice:
             return Span(begin.area, begin.number, end.number - begin.number + 1)
         return None
 
-    def _row(self, tag: Tag, served: Served) -> Row:
+    def _row(self, tag: Tag, served: Served) -> ServedTag:
         own = self._own(tag.name)
         place = ("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
@@ -153,7 +153,7 @@ class ServedDevice:
             tag = replace(tag, write=None)
         else:
             tag = replace(tag, origin=replace(tag.origin, held=True))
-        return Row(
+        return ServedTag(
             tag=tag,
             source=source if isinstance(source, str) else None,
             hold_last=hold_last,
@@ -181,9 +181,9 @@ class ServedDevice:
                     return own
         return {}
 
-    def _check_overlaps(self, rows: Sequence[Row]) -> None:
+    def _check_overlaps(self, rows: Sequence[ServedTag]) -> None:
         """Two tags may show one word only as different parts of it, or where a master writes."""
-        known: dict[tuple[str, int], list[Row]] = {}
+        known: dict[tuple[str, int], list[ServedTag]] = {}
         for row in rows:
             for cell in cells_of(row.tag.span):
                 others = known.setdefault(cell, [])
@@ -313,7 +313,7 @@ def check_retained(
             to.add((*path, "retain"), why)
 
 
-def _rows(lines: Sequence[LineConfig]) -> Iterator[tuple[Path, Row]]:
+def _rows(lines: Sequence[LineConfig]) -> Iterator[tuple[Path, ServedTag]]:
     for line in lines:
         for device in line.devices:
             path = ("lines", line.name, "devices", device.name, "tags")

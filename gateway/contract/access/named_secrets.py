@@ -66,7 +66,7 @@ class NamedSecrets:
 
     def _reject(self, why: str) -> None:
         self._secrets, self._version = {}, None
-        log.error("secrets rejected", why=why, so="every write is refused")
+        log.error("secrets rejected", why=why, effect="every write is refused")
 
     def _stat(self) -> tuple[int, ...] | None:
         try:

@@ -5,7 +5,7 @@ from itertools import islice
 from typing import TypeVar
 
 from gateway.contract.interfaces import History
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.errors import Damaged
 from gateway.tags import Sample, Tag
 from gateway.tags.sample import has_value
@@ -16,7 +16,7 @@ T = TypeVar("T")
 def samples(
     history: History,
     tag: Tag,
-    asked: Question,
+    asked: HistoryQuery,
     limit: int | None,
     now: int,
     pause: Callable[[], None],

@@ -10,7 +10,7 @@ from gateway.errors import GatewayError, NotSent
 from gateway.protocols.capabilities import Controllable
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.tags import Tag, WriteResult
-from gateway.tags.decoding import Part
+from gateway.tags.decoding import WordPart
 from gateway.tags.tag import OriginWord
 from gateway.values import Value
 
@@ -75,7 +75,7 @@ class Write:
     resyncs: Resyncs = NO_RESYNCS
     group: Group | None = None
     masked: bool = False  # the device changes the bits of its word by itself
-    part: Part | None = field(init=False)  # of its word, which it changes; None: whole words
+    part: WordPart | None = field(init=False)  # of its word, which it changes; None: whole words
     origin: OriginWord | None = field(init=False)  # of its values, as users see it
     races: bool = field(init=False)  # bits around it are written as they were read
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps

@@ -133,7 +133,9 @@ class Listening(Rule):
         """Starts to listen, perhaps in the middle of a frame."""
         devices = self._speakers
         self._last = now
-        self._ear = self._stations[devices[0].driver.station].driver.ear(self._character)
+        self._traffic_reader = self._stations[devices[0].driver.station].driver.traffic_reader(
+            self._character
+        )
         self._pairing = Pairing(max(one.longest_reply for one in devices), self._character)
         self._heard = {tag: now for one in devices for tag in one.tags}
         self._look()
@@ -151,7 +153,7 @@ class Listening(Rule):
         """Takes bytes, and learns what they tell."""
         silence, self._last = now - self._last, now
         pairing = self._pairing
-        for heard in self._ear.feed(data, silence):
+        for heard in self._traffic_reader.feed(data, silence):
             match heard:
                 case Asked():
                     pairing.asked(heard, now)

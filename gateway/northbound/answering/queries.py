@@ -17,7 +17,7 @@ from gateway.contract import payload
 from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Family, ParsedKey, max_age, parse_key, part_of
 from gateway.contract.parsing import check_encoding
-from gateway.contract.past.question import is_of_past
+from gateway.contract.past.history_query import is_of_past
 from gateway.contract.payload import Result
 from gateway.contract.problems import Failure, Problem
 from gateway.engine.jobs.requests import Peeked

@@ -16,13 +16,13 @@ from gateway.contract.meta import meta
 from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Bucket, Now
-from gateway.contract.past.question import Question, question
+from gateway.contract.past.history_query import HistoryQuery, question
 from gateway.contract.payload import Result
 from gateway.contract.problems import Failure, Problem
 from gateway.errors import BadValue, Busy, Damaged, GatewayError, NoHistory
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex
-from gateway.northbound.answering.turns import Pause, Rank, Turns
+from gateway.northbound.answering.turns import AnswerTurns, Pause, Rank
 from gateway.northbound.publishing import encoding
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
@@ -51,7 +51,7 @@ class Replies:
     _parts: Parts
     _signed: bool  # requests need the signature of a writer
     _ended: bool = False
-    _turns: Turns = field(default_factory=Turns)
+    _turns: AnswerTurns = field(default_factory=AnswerTurns)
     _clock: Callable[[], float] = time.monotonic
 
     def end(self) -> None:
@@ -142,7 +142,7 @@ class Replies:
         query: zenoh.Query,
         history: History,
         tags: Sequence[Tag],
-        asked: Question,
+        asked: HistoryQuery,
         now: int,
         pause: Pause,
     ) -> None:

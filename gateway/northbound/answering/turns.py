@@ -34,7 +34,7 @@ class _Turn:
         self.begins = threading.Event()
 
 
-class Turns:
+class AnswerTurns:
     """Used by the answering threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

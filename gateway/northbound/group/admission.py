@@ -7,7 +7,7 @@ import zenoh
 
 from gateway.contract.access import secrets
 from gateway.contract.keys import Keys
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.group.claiming import NETWORK_WITHIN, Claiming
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.group.standby import GroupSettings, Standby
@@ -28,7 +28,7 @@ class Admission:
         keys: Keys,
         config: zenoh.Config,
         devices: Iterable[str],
-        duty: Duty,
+        duty: SendPermit,
     ) -> None:
         """`config`: of the gateway's own session. Raises `ConfigError` for a bad secret."""
         self.active = asyncio.Event()

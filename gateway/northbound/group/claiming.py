@@ -114,7 +114,9 @@ class Claiming:
             replies = [] if (asked := key()) is None else await off_loop(_query, session, asked)
             answered = any(reply.ok is not None for reply in replies)
             if answered and self.answered_elsewhere is None:
-                log.warning("queries answered by another program", key=asked, so="it may be old")
+                log.warning(
+                    "queries answered by another program", key=asked, effect="it may be old"
+                )
             self.answered_elsewhere = asked if answered else None
 
     async def run(self, session: zenoh.Session, second: SecondSession) -> None:
@@ -131,7 +133,9 @@ class Claiming:
                     if second.needed:
                         await self._until_seen(view, claims)
         except TimeoutError:
-            log.warning("own claim not seen", so="other gateways with these devices go unnoticed")
+            log.warning(
+                "own claim not seen", effect="other gateways with these devices go unnoticed"
+            )
         if claims.own is None and not (claims.taken() or claims.namesake()):
             await self._claim(session, claims)
         if not self._must_start_over(claims):
@@ -208,7 +212,7 @@ class Claiming:
         for device in sorted(taken.keys() - self.withheld.keys())[:_MOST_LOGGED]:
             log.error("device refused", device=device, why=f"gateway {taken[device]} serves it")
         for device in sorted(self.withheld.keys() - taken.keys())[:_MOST_LOGGED]:
-            log.info("device free", device=device, so="this gateway serves it again")
+            log.info("device free", device=device, effect="this gateway serves it again")
         self.withheld = taken
         self._refused.set()
         return True

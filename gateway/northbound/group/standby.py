@@ -13,7 +13,7 @@ import zenoh
 from gateway.contract.documents.state import StandbyDocument
 from gateway.contract.keys import Keys
 from gateway.contract.rate_limit import RateLimit
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.group.election import Election, Role, RoleToken, State
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
@@ -48,7 +48,7 @@ class Standby:
     """
 
     def __init__(
-        self, settings: GroupSettings, secret: PlantSecret | None, keys: Keys, duty: Duty
+        self, settings: GroupSettings, secret: PlantSecret | None, keys: Keys, duty: SendPermit
     ) -> None:
         """`duty` gets the proof that this gateway is active, again and again."""
         self.enabled = settings.group is not None
@@ -147,7 +147,7 @@ class Standby:
                 self.replaced.set()
             without_link = without_link + 1 if election.waits_for_link else 0
             if without_link == _DECISIONS_WITHOUT_LINK:
-                log.warning("standby link missing", so="the gateway waits for the network")
+                log.warning("standby link missing", effect="the gateway waits for the network")
             if election.needs_query and self._session is not None:
                 await off_loop(self._query_tokens, self._session, replies)
             await asyncio.sleep(_DECIDE_EVERY)

@@ -29,7 +29,7 @@ from gateway.contract.blocks import parts_of
 from gateway.contract.keys import Keys
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.publishing import encoding
-from gateway.northbound.publishing.losses import Losses
+from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.tags import Reason, Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -56,7 +56,7 @@ _Entry = tuple[zenoh.Timestamp | None, str, _Data]
 class Publisher:
     """The queue (event loop) and the thread that empties it."""
 
-    def __init__(self, keys: Keys, losses: Losses) -> None:
+    def __init__(self, keys: Keys, losses: SlowPuts) -> None:
         self.counters = Published()
         self.ended = asyncio.Event()  # the thread has ended, expected or not
         self._keys = keys

@@ -13,7 +13,7 @@ from contextlib import suppress
 
 from gateway.contract.interfaces import Plant
 from gateway.northbound.answering.tag_index import TagIndex
-from gateway.northbound.publishing.losses import Losses
+from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.tags import Quality, Sample, Tag
 
@@ -42,7 +42,7 @@ class Republisher:
         plant: Plant,
         index: TagIndex,
         links: LinkMonitor,
-        losses: Losses,
+        losses: SlowPuts,
         refresh: float,
         parts: Callable[[], Awaitable[None]],
     ) -> None:

@@ -16,7 +16,7 @@ from gateway.contract.foreign import Foreign
 from gateway.contract.parsing import check_encoding
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import BadValue, Busy
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
 
@@ -86,7 +86,7 @@ class Acceptance:
 
     def __init__(
         self,
-        duty: Duty,
+        duty: SendPermit,
         writers: Writers | None,
         wall: Callable[[], int] = time.time_ns,
         accepted: AcceptedUntil | None = None,

@@ -69,7 +69,7 @@ class Watchdog:
     def _fire(self) -> None:
         began = time.monotonic() - LIMIT
         self.has_fired = True
-        log.error("event loop stands still", at=self._place(), so="the Zenoh session is closed")
+        log.error("event loop stands still", at=self._place(), effect="the Zenoh session is closed")
         with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._returned, began)
         for session in self._sessions():
@@ -87,5 +87,5 @@ class Watchdog:
 
     def _returned(self, began: float) -> None:
         stood = round(time.monotonic() - began, 1)
-        log.error("event loop stood still", seconds=stood, so="the gateway starts over")
+        log.error("event loop stood still", seconds=stood, effect="the gateway starts over")
         self._on_return()

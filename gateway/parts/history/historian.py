@@ -11,10 +11,10 @@ from typing import TypeVar
 
 from gateway.contract.documents.state import HistoryDocument
 from gateway.contract.past.buckets import Bucket, Now
-from gateway.contract.past.question import Question
+from gateway.contract.past.history_query import HistoryQuery
 from gateway.contract.past.timerange import TimeRange, time_range
 from gateway.errors import BadValue, Busy
-from gateway.parts.history.answers.course import Course
+from gateway.parts.history.answers.bucket_search import BucketSearch
 from gateway.parts.history.answers.outcomes import Outcome, Outcomes, Ring
 from gateway.parts.history.answers.recent import Recent
 from gateway.parts.history.answers.search import Search
@@ -51,7 +51,7 @@ class Historian:
         rings = self._written, self._refused, self._alarms
         self._reader = Reader(path)
         self._search = Search(self._recent, self._reader)
-        self._course = Course(self._recent, self._reader, self._search.damage)
+        self._course = BucketSearch(self._recent, self._reader, self._search.damage)
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
@@ -123,7 +123,7 @@ class Historian:
         return islice(_readable(self._search.by_time(tag, period)), limit)
 
     def buckets(
-        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: Now, pause: Callable[[], None]
     ) -> Iterator[Bucket]:
         """Yields the buckets of a tag in the order of time; nothing for a tag without samples.
 
@@ -136,7 +136,7 @@ class Historian:
         return _readable(self._course.buckets(tag, period, width, now, pause))
 
     def newest(
-        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+        self, tag: Tag, question: HistoryQuery, now: int, pause: Callable[[], None]
     ) -> Iterator[Sample]:
         """Yields the newest samples of the range in the order of time. Raises like `samples`."""
         period = self._range(question.time_range, question.last, now)

@@ -18,7 +18,7 @@ from gateway.errors import ConfigError
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
 from gateway.protocols.driver import Address, Span
 from gateway.protocols.listening import Asked, Listenable
-from gateway.simulator.recorded import Change, Course, Unit, units_asked
+from gateway.simulator.recorded import Change, RecordedValues, Unit, units_asked
 from gateway.tags import Reason, Sample
 from gateway.tags.unit_tag import unit_tag
 from gateway.values import Value
@@ -60,7 +60,7 @@ class _Part:
 
     def asks(self, data: bytes, character: float) -> bool:
         """Returns True for one whole request."""
-        heard = self.driver.ear(character).feed(data, math.inf)
+        heard = self.driver.traffic_reader(character).feed(data, math.inf)
         return len(heard) == 1 and isinstance(heard[0], Asked)
 
 
@@ -148,11 +148,11 @@ def timed(log: Iterable[LoggedPiece | LoggedValue]) -> Iterator[LoggedPiece]:
 
 def stations_asked(driver: Listenable, log: Sequence[LoggedPiece], character: float) -> list[int]:
     """Returns the numbers of the stations that requests of the protocol name."""
-    found, last, ear = set[int](), -math.inf, driver.ear(character)
+    found, last, reader = set[int](), -math.inf, driver.traffic_reader(character)
     for piece in log:
         at = _at(piece)
         silence, last = (at - last if math.isfinite(last) else SILENT_BEFORE), at
-        found |= {one.station for one in ear.feed(piece.data, silence) if isinstance(one, Asked)}
+        found |= {one.station for one in reader.feed(piece.data, silence) if isinstance(one, Asked)}
     return sorted(found)
 
 
@@ -164,12 +164,12 @@ def of_units(line: LineConfig, log: Sequence[LoggedPiece]) -> LineConfig:
     return replace(line, devices=tuple(one for one in devices if one.tags))
 
 
-def courses(line: LineConfig, log: Iterable[LoggedPiece]) -> Mapping[str, Course]:
+def courses(line: LineConfig, log: Iterable[LoggedPiece]) -> Mapping[str, RecordedValues]:
     """Returns the values of each device by time. `line`: of units.
 
     Raises `ConfigError` for a protocol whose traffic cannot be learned.
     """
-    found = {device.name: Course() for device in line.devices}
+    found = {device.name: RecordedValues() for device in line.devices}
     newest: dict[tuple[str, Unit], int] = {}
     doubtful: dict[tuple[str, Unit], Change] = {}  # until the next reply: it may turn them bad
 

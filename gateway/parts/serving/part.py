@@ -11,7 +11,7 @@ from gateway.parts.serving.served_line import ServedLine
 from gateway.parts.serving.served_lines import ServedLines
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.plant.plant import Plant
-from gateway.stations.served.station import Station
+from gateway.stations.served.station import ServedStation
 from gateway.tags import Sample
 
 
@@ -66,7 +66,7 @@ def served_documents(lines: Iterable[ServedLine], now: float) -> dict[str, Docum
     return found
 
 
-def _station(station: Station, now: float) -> DeviceDocument:
+def _station(station: ServedStation, now: float) -> DeviceDocument:
     """One station. The fields of polls are empty: it sends no request."""
     counts, driver = station.counts, station.driver
     return {

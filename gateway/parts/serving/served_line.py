@@ -16,14 +16,14 @@ from gateway.config import LineConfig
 from gateway.engine.device.records import COMPLETE, CallState, LineRecord
 from gateway.errors import LineDown
 from gateway.line.opening import REOPEN_LONGEST, OpenPort, Pauses
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.line.wire_log import WireLog
 from gateway.parts.serving.conversation import Conversation
 from gateway.stations.served.answering import Answerer, Answering, Heard, Wire
 from gateway.stations.served.echo import Echo
-from gateway.stations.served.registers import Registers, Row, Served
+from gateway.stations.served.registers import Registers, Served, ServedTag
 from gateway.stations.served.registry import answerer
-from gateway.stations.served.station import Presence, Station
+from gateway.stations.served.station import Presence, ServedStation
 from gateway.tags import Sample
 from gateway.transport import (
     ModemAddress,
@@ -43,7 +43,7 @@ class ServedSink(Protocol):
 
     def samples(self, samples: Sequence[Sample]) -> None: ...
 
-    def online(self, device: Station, online: bool) -> None: ...
+    def online(self, device: ServedStation, online: bool) -> None: ...
 
 
 class ServedLine:
@@ -53,16 +53,16 @@ class ServedLine:
         self,
         config: LineConfig,
         sink: ServedSink,
-        sample_of: Callable[[Row], Sample | None],
+        sample_of: Callable[[ServedTag], Sample | None],
         *,
         open_port: OpenPort | None = None,
         wall: Callable[[], int] = time.time_ns,
-        duty: Duty | None = None,
+        duty: SendPermit | None = None,
     ) -> None:
         """`sample_of`: the present sample of a row. `wall`: ns since 1970."""
         self.config = config
         self.stations = {
-            device.driver.station: Station(
+            device.driver.station: ServedStation(
                 device.name, device.driver, Registers(device.served or Served(rows=()), sample_of)
             )
             for device in config.devices
@@ -77,7 +77,7 @@ class ServedLine:
         self._open_port = open_port
         prepare(config.port)
         self._wall = wall
-        self._duty = duty or Duty()
+        self._duty = duty or SendPermit()
         self.wire_log = WireLog()
         self._lost = False
         self._wake = asyncio.Event()  # the port is lost, or a master is there again
@@ -178,7 +178,7 @@ class ServedLine:
                 async with asyncio.timeout_at(None if due == NEVER else due):
                     await self._wake.wait()
 
-    def _expire(self, station: Station) -> None:
+    def _expire(self, station: ServedStation) -> None:
         was = station.presence
         self._give(station.expire(_now(), self._wall()))
         if station.presence is Presence.SILENT is not was:

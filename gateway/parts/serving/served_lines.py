@@ -10,12 +10,12 @@ import structlog
 
 from gateway.config import Config
 from gateway.errors import BadValue, Busy
-from gateway.line.send_permit import Duty
+from gateway.line.send_permit import SendPermit
 from gateway.parts.serving.served_line import ServedLine, ServedSink
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
-from gateway.stations.served.registers import Registers, Row
-from gateway.stations.served.station import Station
+from gateway.stations.served.registers import Registers, ServedTag
+from gateway.stations.served.station import ServedStation
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value
 
@@ -32,11 +32,11 @@ class ServedLines:
         sample_of: Callable[[str], Sample | None],
         *,
         wall: Callable[[], int] = time.time_ns,
-        duty: Duty | None = None,
+        duty: SendPermit | None = None,
     ) -> None:
         """`sample_of`: the present sample of a tag by `device/tag`. `wall`: ns since 1970."""
 
-        def sample(row: Row) -> Sample | None:
+        def sample(row: ServedTag) -> Sample | None:
             return sample_of(row.source or row.tag.key)
 
         self.lines = [
@@ -51,7 +51,7 @@ class ServedLines:
         self._rows = {row.tag: row for one in self.stations for row in one.registers.served.rows}
         self._retained: dict[Tag, Value] = {}
         # By source or own tag: the stations that answer with its last good value.
-        self.remembering: dict[str, list[tuple[Registers, Row]]] = {}
+        self.remembering: dict[str, list[tuple[Registers, ServedTag]]] = {}
         for station in self.stations:
             for row in station.registers.served.rows:
                 if row.hold_last and not row.accepted:
@@ -59,7 +59,7 @@ class ServedLines:
                     kept.append((station.registers, row))
 
     @property
-    def stations(self) -> Sequence[Station]:
+    def stations(self) -> Sequence[ServedStation]:
         return [station for line in self.lines for station in line.stations.values()]
 
     def remember(self, samples: Sequence[Sample]) -> None:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
+from gateway.parts.sharing.guest_requests import NOT_NOW, Unanswered
 from gateway.parts.sharing.stores import Needs, Outcomes, Step
-from gateway.parts.sharing.turns import NOT_NOW, Unanswered
 from gateway.stations.served.answering import Heard
 from gateway.transport import Port
 

@@ -13,9 +13,9 @@ from gateway.errors import LineDown
 from gateway.line.line import Line
 from gateway.line.opening import Pauses
 from gateway.parts.sharing.guest import Guest
+from gateway.parts.sharing.guest_requests import GuestRequests
 from gateway.parts.sharing.settings import RAW, Door
 from gateway.parts.sharing.tunnel import Tunnel
-from gateway.parts.sharing.turns import Turns
 from gateway.plant.plant import Plant
 from gateway.stations.served.answering import Answerer, Answering, Wire
 from gateway.stations.served.echo import Echo
@@ -33,7 +33,12 @@ class OpenDoor:
     """The task of one door. The listener bounds the number of its programs."""
 
     def __init__(
-        self, settings: Door, turns: Turns, plant: Plant, tasks: asyncio.TaskGroup, audit: Audit
+        self,
+        settings: Door,
+        turns: GuestRequests,
+        plant: Plant,
+        tasks: asyncio.TaskGroup,
+        audit: Audit,
     ) -> None:
         self.settings = settings
         self.turns = turns

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 
 from gateway.config import Config
 from gateway.contract.documents.state import DoorDocument
+from gateway.parts.sharing.guest_requests import GuestRequests
 from gateway.parts.sharing.open_door import OpenDoor
 from gateway.parts.sharing.settings import Sharing
-from gateway.parts.sharing.turns import Turns
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.tags import Tag
 
@@ -23,7 +23,7 @@ class SharingPart:
     async def run(self) -> None:
         plant = self._core.plant
         lines = {door.line for door in self._sharing.doors}
-        turns = {line: Turns(plant.any_address, self._core.north) for line in lines}
+        turns = {line: GuestRequests(plant.any_address, self._core.north) for line in lines}
         async with asyncio.TaskGroup() as tasks:
             self._doors = [
                 OpenDoor(door, turns[door.line], plant, tasks, self._core.others.audit)

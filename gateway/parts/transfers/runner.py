@@ -11,9 +11,8 @@ import structlog
 
 from gateway.contract.documents.state import TransferDocument
 from gateway.errors import GatewayError
-from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
-from gateway.parts.transfers.row import Row, State
+from gateway.parts.transfers.transfer_row import Carry, SourceReading, State, TransferRow
 from gateway.plant.doors import Condition, Reading
 from gateway.plant.plant import Plant
 from gateway.tags import AlarmRule, Level, Quality, Reason, Sample, Tag, WriteResult, bad
@@ -36,7 +35,7 @@ class _Running:
     """A row with its tags and its task."""
 
     rule: TransferRule
-    row: Row
+    row: TransferRow
     source: Tag | None = None
     target: Tag | None = None
     carried: WriteResult | None = None  # the last one
@@ -91,7 +90,7 @@ class Transfers:
 
     def _begin(self, rule: TransferRule, source: Tag, target: Tag) -> None:
         now = asyncio.get_running_loop().time()
-        one = _Running(rule, Row(rule, now, fills=self._plant.holds(target)))
+        one = _Running(rule, TransferRow(rule, now, fills=self._plant.holds(target)))
         self._add(one, source, target)
         self._plant.age(source)  # from now on it is known
         self.publish([self._plant.sample(source)])
@@ -177,12 +176,12 @@ class Transfers:
             at = self._plant.wall()
             self._plant.samples([bad(one.target, reason, at, f"{one.name}: {old.why}")])
 
-    def _reading(self, source: Tag) -> rows.Reading:
+    def _reading(self, source: Tag) -> SourceReading:
         sample = self._plant.sample(source)
         known = sample.value if sample.quality is Quality.GOOD else None
-        return rows.Reading(known, self._plant.age(source), sample.reason, sample.detail)
+        return SourceReading(known, self._plant.age(source), sample.reason, sample.detail)
 
-    async def _carry(self, one: _Running, carry: rows.Carry) -> Outcome:
+    async def _carry(self, one: _Running, carry: Carry) -> Outcome:
         target, value = one.target, carry.value
         if target is None:
             raise AssertionError(f"{one.name} has no target")

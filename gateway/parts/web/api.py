@@ -18,7 +18,7 @@ from gateway.contract.interfaces import History
 from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
 from gateway.contract.past.buckets import Now
-from gateway.contract.past.question import question
+from gateway.contract.past.history_query import question
 from gateway.contract.problems import Problem
 from gateway.errors import BadValue, Busy, GatewayError
 from gateway.parts.web.connections import Places

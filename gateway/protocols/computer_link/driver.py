@@ -22,7 +22,6 @@ from gateway.protocols.computer_link.codec import (
     Text,
 )
 from gateway.protocols.computer_link.devices import DEVICE, PROFILES, Profile, ProfileName
-from gateway.protocols.computer_link.ear import Read, learn, link_ear
 from gateway.protocols.computer_link.replies import (
     AREA_C_ECHO,
     NO_REPLY_CAUSES,
@@ -39,6 +38,7 @@ from gateway.protocols.computer_link.scattered import (
     monitored_access,
     scattered_access,
 )
+from gateway.protocols.computer_link.traffic import Read, learn, link_traffic_reader
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import (
     EVERY_REQUEST,
@@ -52,7 +52,7 @@ from gateway.protocols.driver import (
     Traits,
 )
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
-from gateway.protocols.listening import Ear, Learn
+from gateway.protocols.listening import Learn, TrafficReader
 
 LinkTalk = Talk[Frame]
 T = TypeVar("T")
@@ -299,8 +299,8 @@ class ComputerLink:
     def framing(self) -> Hashable:
         return self.protocol, self.frame_format, self.sum_check
 
-    def ear(self, character: float) -> Ear:
-        return link_ear(self.frame_format, self.sum_check)
+    def traffic_reader(self, character: float) -> TrafficReader:
+        return link_traffic_reader(self.frame_format, self.sum_check)
 
     def learn(self, read: Read, span: Span) -> Learn | None:
         return learn(read, self._limits, span)

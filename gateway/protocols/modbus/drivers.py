@@ -7,12 +7,16 @@ from typing import ClassVar, Literal
 from gateway.errors import ConfigError
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.driver import Timing, Traits
-from gateway.protocols.listening import Ear
+from gateway.protocols.listening import TrafficReader
 from gateway.protocols.modbus import ascii as ascii_
 from gateway.protocols.modbus import mbap, rtu
 from gateway.protocols.modbus.addressing import Dialect, Limits
-from gateway.protocols.modbus.ear import MbapEar, RtuEar, ascii_ear
 from gateway.protocols.modbus.master import Master
+from gateway.protocols.modbus.traffic import (
+    MbapTrafficReader,
+    RtuTrafficReader,
+    ascii_traffic_reader,
+)
 from gateway.values import Kind
 
 _FASTEST_SILENCE = 0.00175  # seconds; above 19200 baud 3.5 characters would be shorter
@@ -44,8 +48,8 @@ class ModbusRtu(Master):
     def chars(self, pdu_length: int) -> int:
         return rtu.chars(pdu_length)
 
-    def ear(self, character: float) -> Ear:
-        return RtuEar(character)
+    def traffic_reader(self, character: float) -> TrafficReader:
+        return RtuTrafficReader(character)
 
     @property
     def reply_starts(self) -> Sequence[bytes]:
@@ -69,8 +73,8 @@ class ModbusAscii(Master):
     def chars(self, pdu_length: int) -> int:
         return ascii_.chars(pdu_length)
 
-    def ear(self, character: float) -> Ear:
-        return ascii_ear()
+    def traffic_reader(self, character: float) -> TrafficReader:
+        return ascii_traffic_reader()
 
     @property
     def reply_starts(self) -> Sequence[bytes]:
@@ -99,5 +103,5 @@ class ModbusTcp(Master):
     def chars(self, pdu_length: int) -> int:
         return mbap.chars(pdu_length)
 
-    def ear(self, character: float) -> Ear:
-        return MbapEar()
+    def traffic_reader(self, character: float) -> TrafficReader:
+        return MbapTrafficReader()

@@ -18,10 +18,10 @@ from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span, Talk, Unit
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Place
-from gateway.protocols.modbus.ear import Read
 from gateway.protocols.modbus.frame import Frame, answer_length
 from gateway.protocols.modbus.identity import NAMES, identify
 from gateway.protocols.modbus.settings import Settings
+from gateway.protocols.modbus.traffic import Read
 
 T = TypeVar("T")
 _REMEMBERED = 1024  # spans whose request is kept ready

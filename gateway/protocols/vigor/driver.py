@@ -12,7 +12,7 @@ from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import PROOF, Address, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
-from gateway.protocols.listening import Ear, Learn
+from gateway.protocols.listening import Learn, TrafficReader
 from gateway.protocols.vigor.codec import (
     FORCE_OFF,
     FORCE_ON,
@@ -35,7 +35,7 @@ from gateway.protocols.vigor.devices import (
     bytes_from_bits,
     cover,
 )
-from gateway.protocols.vigor.ear import vigor_ear
+from gateway.protocols.vigor.traffic import vigor_traffic_reader
 
 # Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
 _BLOCK_REQUEST, _FORCE_REQUEST = 14, 12
@@ -179,8 +179,8 @@ class Vigor:
     def framing(self) -> Hashable:
         return self.protocol
 
-    def ear(self, character: float) -> Ear:
-        return vigor_ear()
+    def traffic_reader(self, character: float) -> TrafficReader:
+        return vigor_traffic_reader()
 
     def learn(self, read: tuple[int, int], span: Span) -> Learn | None:
         """`read`: address and number of the bytes."""

@@ -18,7 +18,7 @@ from gateway.tags.timestamps import rfc3339
 
 log = structlog.get_logger("gateway")
 
-_SO = "the gateway goes on with the file as it was"
+_EFFECT = "the gateway goes on with the file as it was"
 _MOST_LOGGED = 20  # mistakes
 READ_WITHIN = 120.0  # seconds: a network file system may hang
 
@@ -67,9 +67,11 @@ class Reloader:
         """Notes that the file changes nothing, with a sentence for each mistake."""
         self._refused = self._wall(), why
         for sentence in why[:_MOST_LOGGED]:
-            log.error("file refused", why=sentence, so=_SO)
+            log.error("file refused", why=sentence, effect=_EFFECT)
         if len(why) > _MOST_LOGGED:
-            log.error("file refused", why=f"and {len(why) - _MOST_LOGGED} more mistakes", so=_SO)
+            log.error(
+                "file refused", why=f"and {len(why) - _MOST_LOGGED} more mistakes", effect=_EFFECT
+            )
 
     def accept(self, config: Config, difference: Difference | None = None) -> None:
         """Notes that the gateway has taken over the file."""

@@ -15,7 +15,7 @@ from gateway.protocols.modbus.frame import (
     WRITE_MANY,
     WRITE_SINGLE,
 )
-from gateway.stations.modbus.dialects import Part, Runs, parts_of, runs_by_function
+from gateway.stations.modbus.dialects import RunPiece, Runs, parts_of, runs_by_function
 from gateway.stations.store import Cell, Denied, Rejected, Store, Why, Written
 
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE, _FAILURE = "01", "02", "03", "04"
@@ -75,13 +75,13 @@ class ModbusData:
         units = self._read(self._parts(runs, wire, count))
         return bytes((function,)) + _packed(function, units), "", ()
 
-    def _parts(self, runs: Runs, wire: int, count: int) -> list[Part]:
+    def _parts(self, runs: Runs, wire: int, count: int) -> list[RunPiece]:
         parts = list(parts_of(runs, wire, count))
         if sum(part.size for part in parts) != count:
             raise Rejected(_ILLEGAL_ADDRESS)
         return parts
 
-    def _read(self, parts: Sequence[Part]) -> list[int]:
+    def _read(self, parts: Sequence[RunPiece]) -> list[int]:
         units: list[int] = []
         for run, ahead, size in parts:
             if not run.halves:
@@ -97,7 +97,7 @@ class ModbusData:
         low, high = unit & 0xFFFF, unit >> 16 & 0xFFFF
         return (low, high) if self._low_first else (high, low)
 
-    def _write(self, parts: Sequence[Part], units: Sequence[int]) -> Written:
+    def _write(self, parts: Sequence[RunPiece], units: Sequence[int]) -> Written:
         """Writes all parts as one. Raises `Denied`, and then nothing is written."""
         given = iter(units)
         cells: list[tuple[Cell, int]] = []

@@ -20,7 +20,7 @@ class Run(NamedTuple):
     halves: bool = False  # two addresses share one 32-bit unit
 
 
-class Part(NamedTuple):
+class RunPiece(NamedTuple):
     """The piece of a request that lies in one run: `size` addresses from its `ahead`th on."""
 
     run: Run
@@ -85,12 +85,12 @@ def runs_by_function(dialect: str) -> dict[int, Runs]:
     return served | {write: served[read] for write, read in _WRITES.items() if read in served}
 
 
-def parts_of(runs: Runs, wire: int, count: int) -> Iterator[Part]:
+def parts_of(runs: Runs, wire: int, count: int) -> Iterator[RunPiece]:
     """Yields the pieces of the addresses that exist, in order."""
     for run in sorted(runs):
         start, end = max(wire, run.wire), min(wire + count, run.wire + run.size)
         if start < end:
-            yield Part(run, start - run.wire, end - start)
+            yield RunPiece(run, start - run.wire, end - start)
 
 
 def memory_of(dialect: str, holes: Iterable[Cell]) -> Memory:

@@ -12,7 +12,7 @@ STALE_AFTER = 10.0  # seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class ServedTag:
     """One value at addresses of the station.
 
     The master reads the value of `source` (`device/tag`), or a value that is held: clients write
@@ -30,7 +30,7 @@ class Row:
 class Served:
     """The settings of a served station. `stale_after` in seconds."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[ServedTag, ...]
     accept: tuple[Span, ...] = ()  # the addresses that the master may write
     stale_after: float = STALE_AFTER
 
@@ -48,18 +48,18 @@ class Registers:
     A value that the master writes is good from then on, until `expire`.
     """
 
-    def __init__(self, served: Served, sample_of: Callable[[Row], Sample | None]) -> None:
+    def __init__(self, served: Served, sample_of: Callable[[ServedTag], Sample | None]) -> None:
         """`sample_of`: the present sample of a row that the master reads; None: there is none."""
         self.served = served
         self._sample_of = sample_of
-        self._cells: dict[Cell, list[Row]] = {}
+        self._cells: dict[Cell, list[ServedTag]] = {}
         for row in served.rows:
             for cell in cells_of(row.tag.span):
                 self._cells.setdefault(cell, []).append(row)
         self._accepted = {cell for span in served.accept for cell in cells_of(span)}
         self._written: dict[Cell, int] = {}
         self._good: set[Tag] = set()  # of those that the master writes
-        self._last: dict[Row, Sequence[int]] = {}  # the last good units
+        self._last: dict[ServedTag, Sequence[int]] = {}  # the last good units
 
     @property
     def written_tags(self) -> list[Tag]:
@@ -70,7 +70,7 @@ class Registers:
 
     def read(self, area: str, start: int, count: int) -> list[int]:
         """Returns the units. Raises `Denied`."""
-        known: dict[Row, Sequence[int]] = {}
+        known: dict[ServedTag, Sequence[int]] = {}
         return [self._unit((area, number), known) for number in range(start, start + count)]
 
     def read_points(self, area: str, start: int, count: int) -> list[int]:
@@ -82,10 +82,10 @@ class Registers:
         cells = [(area, number) for number in range(start, start + count)]
         if not any(map(self._has, cells)):
             raise Denied(Why.NO_TAG)
-        known: dict[Row, Sequence[int]] = {}
+        known: dict[ServedTag, Sequence[int]] = {}
         return [self._point(cell, known) for cell in cells]
 
-    def _point(self, cell: Cell, known: dict[Row, Sequence[int]]) -> int:
+    def _point(self, cell: Cell, known: dict[ServedTag, Sequence[int]]) -> int:
         if cell in self._accepted:
             return self._written.get(cell, 0)
         return self._unit(cell, known) if cell in self._cells else 0
@@ -93,7 +93,7 @@ class Registers:
     def _has(self, cell: Cell) -> bool:
         return cell in self._cells or cell in self._accepted
 
-    def _unit(self, cell: Cell, known: dict[Row, Sequence[int]]) -> int:
+    def _unit(self, cell: Cell, known: dict[ServedTag, Sequence[int]]) -> int:
         rows = self._cells.get(cell)
         if cell in self._accepted:
             for row in rows or ():
@@ -113,7 +113,7 @@ class Registers:
                 unit |= units[cell[1] - tag.span.start]
         return unit
 
-    def _units(self, row: Row) -> Sequence[int]:
+    def _units(self, row: ServedTag) -> Sequence[int]:
         units = _encoded(row.tag, self._sample_of(row))
         if units is None:
             if row.hold_last and row in self._last:
@@ -123,7 +123,7 @@ class Registers:
             self._last[row] = units
         return units
 
-    def remember(self, row: Row, sample: Sample) -> None:
+    def remember(self, row: ServedTag, sample: Sample) -> None:
         """Keeps a good sample of the source for `hold_last`."""
         if (units := _encoded(row.tag, sample)) is not None:
             self._last[row] = units
@@ -145,13 +145,13 @@ class Registers:
         """
         if missing:
             raise Denied(Why.PART)
-        new, known = dict(cells), dict[Row, Sequence[int]]()
+        new, known = dict(cells), dict[ServedTag, Sequence[int]]()
         for cell, bit in points:
             if cell in self._accepted:
                 new[cell] = bit
             elif bit != self._point(cell, known):
                 raise Denied(Why.NOT_ACCEPTED)
-        touched: dict[Row, None] = {}
+        touched: dict[ServedTag, None] = {}
         for cell in new:
             if cell not in self._accepted:
                 raise Denied(Why.NOT_ACCEPTED)

@@ -33,7 +33,7 @@ class Counts:
 
 
 @dataclass(slots=True, eq=False)
-class Station:
+class ServedStation:
     """Synchronous; every change of its tags and of its presence is a result."""
 
     name: str

@@ -11,8 +11,8 @@ from gateway.errors import Busy, Damaged
 from gateway.parts.history.answers.recent import Identity, Recent, SortedRun
 from gateway.parts.history.store.damage import Damage
 from gateway.parts.history.store.index import GROUP, Places
-from gateway.parts.history.store.reader import Part, Reader, in_order
-from gateway.parts.history.store.rows import Row, from_row
+from gateway.parts.history.store.reader import Reader, SampleSource, in_order
+from gateway.parts.history.store.rows import StoredRow, from_row
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.sample import has_value
@@ -51,9 +51,9 @@ class Search:
 
         def read(run: SortedRun) -> Iterator[Sample]:
             groups = stored.places(run, numbers)
-            return in_order(Part(each.first, partial(group, run, each)) for each in groups)
+            return in_order(SampleSource(each.first, partial(group, run, each)) for each in groups)
 
-        parts = [Part(run.first, partial(read, run)) for run in runs]
+        parts = [SampleSource(run.first, partial(read, run)) for run in runs]
         parts += [_part_of(run, period) for run in newest]
         for sample in in_order(parts):
             begun = True
@@ -172,7 +172,7 @@ class StoredRuns:
 
     def rows(
         self, run: SortedRun, numbers: Collection[int], first: int = 0
-    ) -> Iterator[list[Row] | None]:
+    ) -> Iterator[list[StoredRow] | None]:
         """Yields the rows of the tags in the period, in the order of recording, from the `first`
         sample of the run on; None if the run was dropped. Leaves out what is damaged."""
         for _, places in self.places(run, numbers):
@@ -183,7 +183,7 @@ class StoredRuns:
 
     def read(
         self, run: SortedRun, numbers: Collection[int], places: Sequence[int]
-    ) -> list[Row] | None:
+    ) -> list[StoredRow] | None:
         """Returns the rows of the tags in the period, at these places; None if the run was
         dropped. Leaves out what is damaged."""
         begin, end = self.period
@@ -245,7 +245,7 @@ def _start(after: Place | None, mark: str, period: TimeRange) -> tuple[Place, Ti
     return (mark, after[1], after[2] + 1), TimeRange(EARLIEST, period.last)
 
 
-def _part_of(run: list[Sample], period: TimeRange) -> Part:
+def _part_of(run: list[Sample], period: TimeRange) -> SampleSource:
     found = [sample for sample in run if period.first <= sample.time <= period.last]
     found.sort(key=lambda sample: sample.time)
-    return Part(found[0].time if found else period.first, lambda: found)
+    return SampleSource(found[0].time if found else period.first, lambda: found)

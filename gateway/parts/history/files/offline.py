@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from gateway.errors import GatewayError
-from gateway.parts.history.answers.course import Course
+from gateway.parts.history.answers.bucket_search import BucketSearch
 from gateway.parts.history.answers.outcomes import Ring
 from gateway.parts.history.answers.recent import Extent, Recent
 from gateway.parts.history.answers.search import Search
@@ -26,7 +26,7 @@ _MOST_BUCKETS = 10_000_000  # of one tag: nobody waits for this reader
 
 
 @contextmanager
-def offline(path: Path) -> Iterator[tuple[Search, Course]]:
+def offline(path: Path) -> Iterator[tuple[Search, BucketSearch]]:
     """Opens the history as it is now. Raises `GatewayError`."""
     if not path.is_file():
         raise GatewayError(f"there is no history {path}")
@@ -35,7 +35,7 @@ def offline(path: Path) -> Iterator[tuple[Search, Course]]:
         recent = _content(path)
         damage = Damage(most_logged=0)  # the answers tell it
         search = Search(recent, reader, damage)
-        yield search, Course(recent, reader, damage, _MOST_BUCKETS)
+        yield search, BucketSearch(recent, reader, damage, _MOST_BUCKETS)
     except (sqlite3.Error, OSError) as error:
         raise GatewayError(f"{path} cannot be read: {error}") from None
     finally:

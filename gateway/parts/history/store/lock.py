@@ -32,7 +32,9 @@ def locked(path: Path) -> int:
         raise BlockingIOError(error.errno, "another gateway writes this file") from None
     except OSError:
         log.warning(
-            "history lock unavailable", path=str(path), so="only one gateway may write this file"
+            "history lock unavailable",
+            path=str(path),
+            effect="only one gateway may write this file",
         )
     return file
 

@@ -16,20 +16,20 @@ from gateway.parts.history.answers.outcomes import Outcome, Ring
 from gateway.parts.history.answers.recent import Identity, SortedRun
 from gateway.parts.history.store.file import identity, is_damage, oldest, tags
 from gateway.parts.history.store.index import Index
-from gateway.parts.history.store.rows import Row, checksum
+from gateway.parts.history.store.rows import StoredRow, checksum
 from gateway.tags import Sample
 
 _MOST_INDEXES = 100  # in memory, of 64 to 320 kB
 
 
-class Part(NamedTuple):
+class SampleSource(NamedTuple):
     """The samples of one tag in one run; none is earlier than `first`."""
 
     first: int
     samples: Callable[[], Iterable[Sample]]  # in the order of time
 
 
-def in_order(parts: Iterable[Part]) -> Iterator[Sample]:
+def in_order(parts: Iterable[SampleSource]) -> Iterator[Sample]:
     """Merges parts by time; samples of equal time in the order of the parts.
 
     Starts a part only when the merge reaches its first time. So several parts are open at once
@@ -114,7 +114,7 @@ class Reader:
 
     def rows(
         self, file: Identity | None, run: SortedRun, numbers: Sequence[int]
-    ) -> tuple[list[Row], bool] | None:
+    ) -> tuple[list[StoredRow], bool] | None:
         """Returns these samples of a run, by their numbers in it, and whether some are lost. None
         if the run was dropped. Raises `Damaged`."""
         first = run.number

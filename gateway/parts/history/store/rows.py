@@ -30,7 +30,7 @@ class Kind:
 
 
 # The columns `id, tag, time, value, kind, bad, sum`. The numbers of samples have no gaps.
-Row = tuple[int, int, int, Stored, int | None, str | None, int]
+StoredRow = tuple[int, int, int, Stored, int | None, str | None, int]
 
 
 def checksum(row: tuple[Any, ...]) -> int:
@@ -47,7 +47,7 @@ def to_row(sample: Sample) -> tuple[int, Stored, int | None, str | None]:
     return sample.time, value, kind, bad
 
 
-def with_checksum(number: int, tag: int, sample: Sequence[Stored]) -> Row:
+def with_checksum(number: int, tag: int, sample: Sequence[Stored]) -> StoredRow:
     """Returns the row of a sample, with its checksum."""
     row = (number, tag, *sample)
     return (*row, checksum(row))  # type: ignore[return-value]  # the columns of `to_row`

@@ -19,12 +19,12 @@ from gateway.errors import (
     Unclear,
 )
 from gateway.parts.transfers.codes import DONE, Code, End, outcome_of
-from gateway.parts.transfers.row import Carry, Reading, Row, State
+from gateway.parts.transfers.transfer_row import Carry, SourceReading, State, TransferRow
 from gateway.tags import Reason
 from gateway.tags.transfer import TransferRule
 from gateway.values import Value
 
-BAD = Reading(None, float("inf"), Reason.NO_REPLY)
+BAD = SourceReading(None, float("inf"), Reason.NO_REPLY)
 NOT_DONE = outcome_of(Offline("mixer is offline"))
 UNCLEAR = outcome_of(NoReply("no reply"))
 
@@ -34,15 +34,15 @@ def rule(**settings: Any) -> TransferRule:
     return TransferRule(number=1, **{**names, **settings})
 
 
-def row(**settings: Any) -> Row:
-    return Row(rule(**settings), 0.0)
+def row(**settings: Any) -> TransferRow:
+    return TransferRow(rule(**settings), 0.0)
 
 
-def good(value: Value, age: float = 0.0) -> Reading:
-    return Reading(value, age)
+def good(value: Value, age: float = 0.0) -> SourceReading:
+    return SourceReading(value, age)
 
 
-def carried(one: Row, value: Value, now: float, *, age: float = 0.0) -> Carry | None:
+def carried(one: TransferRow, value: Value, now: float, *, age: float = 0.0) -> Carry | None:
     """The source is published with this value, and the row looks."""
     one.changed(value)
     return one.next(good(value, age), now)
@@ -298,8 +298,8 @@ def test_scale_and_offset_are_exact(
 
 
 def test_a_filled_value_lapses_once_with_its_source_and_is_carried_again() -> None:
-    one = Row(rule(), 0.0, fills=True)
-    starting = Reading(None, float("inf"), Reason.STARTING)
+    one = TransferRow(rule(), 0.0, fills=True)
+    starting = SourceReading(None, float("inf"), Reason.STARTING)
     assert one.lapse(starting) is None
     assert carried(one, 5, 1.0) == Carry(5, within=5.0)
     assert one.lapse(BAD) is None  # the write is under way
@@ -313,7 +313,7 @@ def test_a_filled_value_lapses_once_with_its_source_and_is_carried_again() -> No
     assert one.next(good(5), 9.0) == Carry(5, within=5.0)
     one.ended(DONE, 9.1)
     assert one.lapse(BAD) is not None
-    for other in (row(), Row(rule(substitute=0), 0.0, fills=True)):
+    for other in (row(), TransferRow(rule(substitute=0), 0.0, fills=True)):
         assert carried(other, 5, 1.0) is not None
         other.ended(DONE, 1.1)
         assert other.lapse(BAD) is None

@@ -23,7 +23,7 @@ class Unanswered(Rejected):
 NOT_NOW, NO_REPLY = Unanswered("06"), Unanswered("0B")
 
 
-class Turns:
+class GuestRequests:
     """One line. Belongs to the event loop.
 
     The engine of the line plans each request as it plans those of other clients: with its

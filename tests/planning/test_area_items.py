@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.planning import planner, rows
+from gateway.planning import area_items, planner
 from gateway.planning.coalesce import coalesce
 from gateway.planning.planner import Block, plan, shortest_round
 from gateway.planning.wire_timing import Transactions, WireTiming
@@ -46,10 +46,10 @@ def planned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         lengths.append(len(every))
         return coalesce(every, *rest, **named)
 
-    monkeypatch.setattr(rows, "coalesce", counted)
-    rows._remembered.cache_clear()  # it has no other reader
+    monkeypatch.setattr(area_items, "coalesce", counted)
+    area_items._remembered.cache_clear()  # it has no other reader
     yield lengths
-    rows._remembered.cache_clear()
+    area_items._remembered.cache_clear()
 
 
 def row(letter: str, begin: int, step: int = 2, count: int = 20) -> list[Tag]:
@@ -111,7 +111,7 @@ def test_a_row_that_costs_otherwise_is_planned_anew(
 
 
 def test_very_long_rows_are_not_kept(planned: list[int]) -> None:
-    tags = row("D", 0, step=1, count=rows.LONGEST_KEPT + 1)
+    tags = row("D", 0, step=1, count=area_items.LONGEST_KEPT + 1)
     for _ in range(2):
         plan(tags, DRIVERS[0], seconds(DRIVERS[0]))
     assert len(planned) == 2

@@ -18,7 +18,7 @@ LONGEST_KEPT = 500  # items of a row whose requests are remembered
 Seconds = Callable[[Cost], float]  # of a transaction; equal ones give equal results
 
 
-class Row(NamedTuple):
+class AreaItems(NamedTuple):
     """The items of one area, by address. `ends` are exclusive; `every` in seconds."""
 
     area: str
@@ -28,7 +28,7 @@ class Row(NamedTuple):
     splits: frozenset[int]  # items before which a request must end
 
 
-def requests_of(row: Row, model: Model, seconds: Seconds) -> Sequence[Request]:
+def requests_of(row: AreaItems, model: Model, seconds: Seconds) -> Sequence[Request]:
     """Returns the requests of least wire time for the row.
 
     Raises `ValueError` with the index of an item that fits no request.
@@ -42,7 +42,7 @@ def requests_of(row: Row, model: Model, seconds: Seconds) -> Sequence[Request]:
     return _remembered(row, model, seconds)
 
 
-def cover(row: Row, model: Model, seconds: Seconds) -> tuple[Request, ...]:
+def cover(row: AreaItems, model: Model, seconds: Seconds) -> tuple[Request, ...]:
     """As `requests_of`, always calculated."""
     area, starts, ends, every, splits = row
     driver = model.driver
@@ -66,7 +66,7 @@ def cover(row: Row, model: Model, seconds: Seconds) -> tuple[Request, ...]:
     return tuple(coalesce(every, transaction, splits, even=even))
 
 
-def _of_words(row: Row, model: Model) -> bool:
+def _of_words(row: AreaItems, model: Model) -> bool:
     """Returns True for words inside their area: the cost of a read depends on its size alone."""
     area = model.driver.areas[row.area]
     inside = area.first <= row.starts[0] and row.ends[-1] <= area.last + 1
@@ -74,7 +74,7 @@ def _of_words(row: Row, model: Model) -> bool:
 
 
 @lru_cache(maxsize=1024)
-def _remembered(row: Row, model: Model, seconds: Seconds) -> tuple[Request, ...]:
+def _remembered(row: AreaItems, model: Model, seconds: Seconds) -> tuple[Request, ...]:
     return cover(row, model, seconds)
 
 

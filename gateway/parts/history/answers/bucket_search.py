@@ -37,7 +37,7 @@ class _Part(NamedTuple):
 
 
 @dataclass(eq=False)
-class Course:
+class BucketSearch:
     """Used by the answering threads."""
 
     _recent: Recent

@@ -40,7 +40,7 @@ _STATES = {
 }
 
 
-class Reading(NamedTuple):
+class SourceReading(NamedTuple):
     """The source now. `value`: None if it is bad. `age`: seconds since the last read."""
 
     value: Value | None
@@ -80,7 +80,7 @@ class _Retry:
         self._pause = FIRST_PAUSE
 
 
-class Row:
+class TransferRow:
     """The state of one transfer. Times in seconds of one clock."""
 
     def __init__(self, rule: TransferRule, now: float, *, fills: bool = False) -> None:
@@ -112,7 +112,7 @@ class Row:
             self._next_change = now
         self._retry = _Retry(now)
 
-    def next(self, source: Reading, now: float) -> Carry | None:
+    def next(self, source: SourceReading, now: float) -> Carry | None:
         """Returns the write that is due, which begins now; its end is reported to `ended`."""
         value = self._note_age(source, now)
         if self.writing is not None or now < self._retry.at:
@@ -123,7 +123,7 @@ class Row:
             self.writing = Carry(value, self.rule.stale - source.age)
         return self.writing
 
-    def lapse(self, source: Reading) -> Verdict | None:
+    def lapse(self, source: SourceReading) -> Verdict | None:
         """Returns the state once, when the target must turn bad: it has an old value."""
         found = self.verdict(source)
         if not self._fills or self._lapsed or self.writing or found.state is not State.STALE:
@@ -131,7 +131,7 @@ class Row:
         self._lapsed = True
         return found
 
-    def _note_age(self, source: Reading, now: float) -> Value | None:
+    def _note_age(self, source: SourceReading, now: float) -> Value | None:
         """Returns the value if it may be carried."""
         if source.value is None or not source.age < self.rule.stale:
             return None
@@ -211,7 +211,7 @@ class Row:
         due = self._due if self._due > now else soon
         return min(due, soon) if looks else due
 
-    def verdict(self, source: Reading) -> Verdict:
+    def verdict(self, source: SourceReading) -> Verdict:
         """Returns the state of the row."""
         if source.value is None or not source.age < self.rule.stale:
             return self._stale(source)
@@ -219,7 +219,7 @@ class Row:
             return Verdict(State.STARTING, None, "")
         return Verdict(_STATES[self.last.end], self.last.code, self.last.why)
 
-    def _stale(self, source: Reading) -> Verdict:
+    def _stale(self, source: SourceReading) -> Verdict:
         name = self.rule.text[0]
         if source.value is not None:
             why = f"the last read of {name} is older than {self.rule.stale:g} s"

@@ -27,7 +27,7 @@ class Parameters(Protocol):
     def __contains__(self, name: str) -> bool: ...
 
 
-class Question(NamedTuple):
+class HistoryQuery(NamedTuple):
     """`bucket`: ns, None for samples. `last`: the newest samples, None for all."""
 
     time_range: str
@@ -42,7 +42,7 @@ def is_of_past(parameters: Parameters) -> bool:
     return not parameters.is_empty() and any(name in parameters for name in _OF_PAST)
 
 
-def question(parameters: Mapping[str, str], time: str = "_time") -> Question:
+def question(parameters: Mapping[str, str], time: str = "_time") -> HistoryQuery:
     """Parses the parameters; `time` names the one of the range. Raises `BadValue`."""
     _check_names(parameters, time)
     bucket, agg, last = (parameters.get(name) for name in ("bucket", "agg", "last"))
@@ -56,7 +56,7 @@ def question(parameters: Mapping[str, str], time: str = "_time") -> Question:
     asked = [name for name in ("bucket", "last", "limit", "page") if name in parameters]
     if asked[:1] in (["bucket"], ["last"]) and len(asked) > 1:
         raise BadValue(f"{asked[0]} and {asked[1]} exclude each other: send one of them")
-    return Question(
+    return HistoryQuery(
         parameters.get(time, "[..]"),
         None if bucket is None else _width(bucket),
         AGGREGATES if agg is None else _aggregates(agg),

@@ -7,7 +7,7 @@ A frame does not say its direction. A request to read has another length than it
 from typing import NamedTuple
 
 from gateway.errors import Garbled
-from gateway.protocols.delimited import DelimitedEar
+from gateway.protocols.delimited import DelimitedTrafficReader
 from gateway.protocols.listening import Asked, Heard, Noise, Told
 from gateway.protocols.modbus.ascii import body_of
 from gateway.protocols.modbus.frame import (
@@ -122,8 +122,8 @@ def _length(pdu: bytes, fixed: dict[int, int], counted: dict[int, int]) -> int |
     return place + 1 + pdu[place] if len(pdu) > place else 0
 
 
-class RtuEar:
-    """An `Ear` for Modbus RTU. A frame begins after a silence, or right after a whole frame.
+class RtuTrafficReader:
+    """Reads Modbus RTU. A frame begins after a silence, or right after a whole frame.
 
     A pause inside a frame ends nothing, because adapters cut frames: its length and CRC count.
     """
@@ -185,8 +185,8 @@ class RtuEar:
         return 0 if arriving else None
 
 
-def ascii_ear() -> DelimitedEar:
-    """Returns an `Ear` for Modbus ASCII."""
+def ascii_traffic_reader() -> DelimitedTrafficReader:
+    """Returns a `TrafficReader` for Modbus ASCII."""
     meaning = Meaning()
 
     def take(data: bytes) -> tuple[Asked | Told, int] | int | None:
@@ -197,11 +197,11 @@ def ascii_ear() -> DelimitedEar:
         heard = meaning.of(body[0], body[1:]) if body else None
         return None if heard is None or isinstance(heard, Noise) else (heard, size)
 
-    return DelimitedEar(b":", _LONGEST_ASCII, take)
+    return DelimitedTrafficReader(b":", _LONGEST_ASCII, take)
 
 
-class MbapEar:
-    """An `Ear` for a recording of Modbus TCP: the numbers pair requests and replies."""
+class MbapTrafficReader:
+    """A `TrafficReader` for a recording of Modbus TCP: the numbers pair requests and replies."""
 
     def __init__(self) -> None:
         self._codec = MbapCodec()

@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Address:
+class GatewayAddress:
     """The gateway of a file: its name and its Zenoh session. A `Config` without devices."""
 
     name: str
@@ -41,7 +41,7 @@ class Address:
         return {}
 
 
-def address(path: Path) -> Address | None:
+def address(path: Path) -> GatewayAddress | None:
     """Returns the address of the gateway, without a check of the rest of the file.
 
     None where the two sections have a mistake, or cannot be read without the rest: `load` then
@@ -60,7 +60,9 @@ def address(path: Path) -> Address | None:
     zenoh = with_files(zenoh, path.parent, mistakes)
     if len(mistakes) or ("standby_alone" in gateway and "standby" not in gateway):
         return None
-    return Address(name=gateway.get("name", NAME), standby=gateway.get("standby"), zenoh=zenoh)
+    return GatewayAddress(
+        name=gateway.get("name", NAME), standby=gateway.get("standby"), zenoh=zenoh
+    )
 
 
 def _settings(raw: object, parse: Mapping[str, Callable[[Any], object]]) -> dict[str, Any]:

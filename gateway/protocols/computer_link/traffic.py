@@ -18,7 +18,7 @@ from gateway.protocols.computer_link.codec import (
 )
 from gateway.protocols.computer_link.devices import Profile, wire_name
 from gateway.protocols.computer_link.requests import HEADER, NEVER, area_length
-from gateway.protocols.delimited import DelimitedEar
+from gateway.protocols.delimited import DelimitedTrafficReader
 from gateway.protocols.devices import parse_device
 from gateway.protocols.driver import Span, Unit
 from gateway.protocols.listening import Asked, Learn, Told
@@ -45,7 +45,7 @@ class Read(NamedTuple):
     pieces: int
 
 
-class LinkEar:
+class LinkTrafficReader:
     """Takes the frames at the beginning of the bytes."""
 
     def __init__(self, frame_format: FrameFormat, sum_check: bool) -> None:
@@ -127,9 +127,9 @@ def _digits(read: Read) -> int:
     return dword if "CN200" <= read.device <= "CN255" and read.command == "WR" else word
 
 
-def link_ear(frame_format: FrameFormat, sum_check: bool) -> DelimitedEar:
-    take = LinkEar(frame_format, sum_check).take
-    return DelimitedEar(bytes((ENQ, STX, ACK, NAK)), _LONGEST, take)
+def link_traffic_reader(frame_format: FrameFormat, sum_check: bool) -> DelimitedTrafficReader:
+    take = LinkTrafficReader(frame_format, sum_check).take
+    return DelimitedTrafficReader(bytes((ENQ, STX, ACK, NAK)), _LONGEST, take)
 
 
 def learn(read: Read, profile: Profile, span: Span) -> Learn | None:

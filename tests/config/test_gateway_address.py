@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gateway.config import load
-from gateway.config.address import address
+from gateway.config.gateway_address import address
 
 ROOT = Path(__file__).parents[2]
 LINES = """

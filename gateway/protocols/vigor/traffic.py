@@ -1,7 +1,7 @@
 """Finds requests and replies of the Vigor computer link in the bytes of a line."""
 
 from gateway.errors import Garbled
-from gateway.protocols.delimited import DelimitedEar
+from gateway.protocols.delimited import DelimitedTrafficReader
 from gateway.protocols.listening import Asked, Told
 from gateway.protocols.vigor.codec import (
     ACK,
@@ -16,8 +16,8 @@ from gateway.protocols.vigor.codec import (
 )
 
 
-def vigor_ear() -> DelimitedEar:
-    return DelimitedEar(STX + ACK, LONGEST_REQUEST, _take)
+def vigor_traffic_reader() -> DelimitedTrafficReader:
+    return DelimitedTrafficReader(STX + ACK, LONGEST_REQUEST, _take)
 
 
 def _take(data: bytes) -> tuple[Asked | Told, int] | int | None:

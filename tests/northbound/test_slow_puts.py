@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.northbound.publishing.losses import ROUNDS, Losses
+from gateway.northbound.publishing.slow_puts import ROUNDS, SlowPuts
 from gateway.tags import good
 from tests.northbound.plant import tag
 
@@ -11,17 +11,17 @@ LIMIT = 0.05
 
 
 @pytest.fixture
-def losses() -> Losses:
-    return Losses(LIMIT)
+def losses() -> SlowPuts:
+    return SlowPuts(LIMIT)
 
 
-def test_quick_puts_are_not_put_again(losses: Losses) -> None:
+def test_quick_puts_are_not_put_again(losses: SlowPuts) -> None:
     losses.sent([SPEED], 0.9 * LIMIT, 100.0)
     assert losses.congested == 0
     assert losses.due(1000.0) == []
 
 
-def test_a_slow_put_and_those_after_it_are_put_again_in_rounds(losses: Losses) -> None:
+def test_a_slow_put_and_those_after_it_are_put_again_in_rounds(losses: SlowPuts) -> None:
     losses.sent([LEVEL], LIMIT, 100.0)
     losses.sent([SPEED], 0.0, 100.5)  # a full link drops it at once
     assert losses.congested == 1
@@ -32,7 +32,7 @@ def test_a_slow_put_and_those_after_it_are_put_again_in_rounds(losses: Losses) -
     assert losses.due(1000.0) == []
 
 
-def test_the_next_slow_put_starts_the_rounds_again(losses: Losses) -> None:
+def test_the_next_slow_put_starts_the_rounds_again(losses: SlowPuts) -> None:
     losses.sent([LEVEL], LIMIT, 100.0)
     losses.due(101.0)
     losses.sent([SPEED], LIMIT, 101.5)
@@ -40,20 +40,20 @@ def test_the_next_slow_put_starts_the_rounds_again(losses: Losses) -> None:
     assert losses.due(102.5) == [LEVEL.tag, SPEED.tag]
 
 
-def test_a_suspect_that_was_put_goes_behind_the_others(losses: Losses) -> None:
+def test_a_suspect_that_was_put_goes_behind_the_others(losses: SlowPuts) -> None:
     """A round that a slow put ended continues with the tags that it did not reach."""
     losses.sent([LEVEL, SPEED], LIMIT, 100.0)
     losses.sent([LEVEL], 0.0, 101.0)
     assert losses.due(101.0) == [SPEED.tag, LEVEL.tag]
 
 
-def test_puts_long_after_the_last_slow_one_are_not_suspect(losses: Losses) -> None:
+def test_puts_long_after_the_last_slow_one_are_not_suspect(losses: SlowPuts) -> None:
     losses.sent([LEVEL], LIMIT, 100.0)
     losses.sent([SPEED], 0.0, 100.0 + ROUNDS[-1] + 0.1)
     assert losses.due(101.0) == [LEVEL.tag]
 
 
-def test_reloads_under_a_full_link_keep_no_tag_of_before(losses: Losses) -> None:
+def test_reloads_under_a_full_link_keep_no_tag_of_before(losses: SlowPuts) -> None:
     for n in range(100):  # each reload makes another tag of the same name
         losses.sent([good(tag("mixer", "speed"), n, 0)], LIMIT, 100.0 + n)
     assert len(losses.due(300.0)) == 1

@@ -17,7 +17,7 @@ ROUNDS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 _NEVER = float("-inf")
 
 
-class Losses:
+class SlowPuts:
     """Filled by the publishing thread, emptied on the event loop."""
 
     def __init__(self, limit: float) -> None:
