@@ -153,7 +153,7 @@ BELIEFS = (
     ),
     Belief(
         "noise destroys its replies",
-        "damaged replies in the last 10 s, and no late one for a minute",
+        "damaged replies in the last 10 s, and no late one on the line for a minute",
         "a late reply, or no damaged one",
         "it is waited for late replies again, and resyncs are patient",
         ALIVE_FOR,

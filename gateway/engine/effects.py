@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.requests import Outcome, Request
+from gateway.engine.jobs.requests import Outcome, Request, unsent
+from gateway.errors import GatewayError
 from gateway.tags import Reason, Sample, Tag, bad
 
 
@@ -68,8 +69,9 @@ class Effects:
     def online(self, device: Device, online: bool) -> None:
         self.collected.append(OnlineChange(device, online))
 
-    def ended(self, request: Request, outcome: Outcome) -> None:
-        self.collected.append(RequestEnded(request, outcome))
+    def unsent(self, request: Request, why: GatewayError) -> None:
+        """Ends a request that is not sent."""
+        self.collected.append(RequestEnded(request, unsent(request, why)))
 
     def pause(self, seconds: float) -> None:
         self.collected.append(Pause(seconds))

@@ -205,26 +205,26 @@ class Engine:
         """Queues the request, to be sent after the current transaction, or refuses it."""
         queue, device = self.schedule.requests, request.device
         if device.settings.listen_only:
-            self._effects.ended(request, BadValue(ONLY_LISTENS.format(line=self.name)))
+            self._effects.unsent(request, BadValue(ONLY_LISTENS.format(line=self.name)))
             return self._effects.take()
         if isinstance(request, Write):
             for older in queue.superseded(request):
-                self._effects.ended(older, Superseded("a newer value took its place; not sent"))
+                self._effects.unsent(older, Superseded("a newer value took its place; not sent"))
         elif request.span is None:
             control = device.settings.control
             if why := why_not_commanded(device.driver, request.name, control=control):
-                self._effects.ended(request, BadValue(why))
+                self._effects.unsent(request, BadValue(why))
                 return self._effects.take()
         dials = self.schedule.reaches_by_modem  # for a request at once
         if not (self.is_open or dials):
             why = self.record.trouble or f"line {self.name} is not open"
-            self._effects.ended(request, LineDown(why))
+            self._effects.unsent(request, LineDown(why))
         elif not (dials or self.schedule.reachable(device, now)):
-            self._effects.ended(request, offline(device))
+            self._effects.unsent(request, offline(device))
         elif not (device.identity is None or device.identity.takes_requests):
-            self._effects.ended(request, wrong_device(device))
+            self._effects.unsent(request, wrong_device(device))
         elif not queue.submit(request):
-            self._effects.ended(request, Busy(TOO_MANY.format(line=self.name)))
+            self._effects.unsent(request, Busy(TOO_MANY.format(line=self.name)))
         self._set_deadline()
         return self._effects.take()
 
@@ -239,7 +239,7 @@ class Engine:
         if self.schedule.requests.has_room(len(writes)):
             return [effect for write in writes for effect in self.submit(write, now)]
         for write in writes:
-            self._effects.ended(write, Busy(TOO_MANY.format(line=self.name)))
+            self._effects.unsent(write, Busy(TOO_MANY.format(line=self.name)))
         return self._effects.take()
 
     def expedite(self, device: Device, tag: Tag) -> None:
@@ -300,7 +300,7 @@ class Engine:
         for device in changes.left:
             for request in self.schedule.requests.withdraw(device):
                 why = f"the file was reloaded and changed {device.name}; not sent"
-                self._effects.ended(request, Busy(why))
+                self._effects.unsent(request, Busy(why))
         for device in changes.removed:
             self._effects.online(device, False)
         for old, new in changes.replaced:
@@ -360,7 +360,7 @@ class Engine:
         self.is_open = False
         self.rules.closed()
         for request in self.schedule.requests.withdraw():
-            self._effects.ended(request, LineDown(f"line {self.name}{why}; not sent"))
+            self._effects.unsent(request, LineDown(f"line {self.name}{why}; not sent"))
         self._set_deadline()
         return self._effects.take()
 

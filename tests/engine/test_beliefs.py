@@ -17,6 +17,7 @@ from gateway.engine.results.bit_writes import BitWrites
 from gateway.engine.results.busy_devices import BusyDevices
 from gateway.engine.results.pipelining import Pipelining
 from gateway.engine.results.shorter_silences import ShorterSilences
+from gateway.engine.schedule.probes import is_noisy
 from gateway.errors import Evidence, Garbled, NoReply, Refusal, Refused
 from gateway.line.channel import Echo
 from gateway.planning.planner import Block
@@ -332,14 +333,14 @@ def polls_until_online(rig: Rig, job: Any) -> None:
 
 
 def noise() -> Way:
-    health, spoilt = link_device().health, Garbled("wrong sum", evidence=Evidence.CHECKSUM)
+    one, spoilt = link_device(), Garbled("wrong sum", evidence=Evidence.CHECKSUM)
     for second in range(int(HOUR) + 1):
-        health.unclear(spoilt, None, float(second))
-    assert health.probes.is_noisy(HOUR)
-    late = link_device().health
-    late.unclear(spoilt, None, HOUR)
-    late.replied_late(0.7, 0.5, HOUR, last=False)
-    return lambda after: not (health.probes.is_noisy(HOUR + after) or late.probes.is_noisy(HOUR))
+        one.health.unclear(spoilt, None, float(second))
+    assert is_noisy(one, [one], HOUR)
+    late = link_device()
+    late.health.unclear(spoilt, None, HOUR)
+    late.health.replied_late(0.7, 0.5, HOUR, last=False)
+    return lambda after: not (is_noisy(one, [one], HOUR + after) or is_noisy(late, [late], HOUR))
 
 
 def as_quick_as_before() -> Way:

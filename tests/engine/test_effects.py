@@ -9,10 +9,11 @@ from gateway.engine.effects import (
     Samples,
 )
 from gateway.engine.jobs.requests import Command
+from gateway.errors import Busy
 from gateway.tags import Reason, bad, good
 from tests.sim.plant import device, make_tag
 
-TAG = make_tag("D0")
+TAG, BUSY = make_tag("D0"), Busy("not now")
 
 
 def test_effects_are_taken_once_and_in_their_order() -> None:
@@ -21,13 +22,13 @@ def test_effects_are_taken_once_and_in_their_order() -> None:
     effects.online(dev, True)
     effects.samples([good(TAG, 5, 1)])
     effects.bad([TAG], Reason.REFUSED, 2, "28")
-    effects.ended(command, "acknowledged")
+    effects.unsent(command, BUSY)
     effects.pause(0.1)
     assert effects.take() == [
         OnlineChange(dev, True),
         Samples([good(TAG, 5, 1)]),
         Samples([bad(TAG, Reason.REFUSED, 2, "28")]),
-        RequestEnded(command, "acknowledged"),
+        RequestEnded(command, BUSY),
         Pause(0.1),
     ]
     assert effects.take() == []

@@ -14,9 +14,11 @@ from gateway.engine.device.health import (
     diagnosis,
 )
 from gateway.engine.device.probe_pace import PAUSE_FIRST, PROBE_PAUSE
+from gateway.engine.schedule.probes import is_noisy
 from gateway.errors import Evidence, Garbled, GatewayError, LineDown, NoReply, Unclear
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
+from tests.engine.rig import link_device
 
 S, E = State, Event
 SPAN, OTHER = Span("D", 0, 10), Span("D", 50, 1)
@@ -137,12 +139,20 @@ def test_too_slow_is_kept_over_no_reply_but_not_over_other_trouble() -> None:
     assert seen == [slow, slow, noise, SILENCE]
 
 
-def test_late_answers_end_the_noise() -> None:
-    found = health()
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_late_answer_of_any_device_of_the_line_ends_the_noise(late: int) -> None:
+    """The damaged replies of one may have met the late reply of another."""
+    line = link_device(station=1), link_device(station=2)
+    found = line[0].health
     found.unclear(Garbled("spoiled", evidence=Evidence.NOISE), SPAN, 0.0)
-    assert found.probes.is_noisy(1.0)
-    found.unclear(Garbled("of older requests", evidence=Evidence.SLOW), SPAN, 1.0)
-    assert not found.probes.is_noisy(2.0)
+    assert is_noisy(line[0], line, 1.0)
+    assert not is_noisy(line[1], line, 1.0)
+    older = Garbled("of older requests", evidence=Evidence.SLOW)
+    line[late].health.unclear(older, SPAN, 1.0)
+    assert not is_noisy(line[0], line, 2.0)
+    found.unclear(Garbled("spoiled", evidence=Evidence.NOISE), SPAN, 61.0)
+    assert not is_noisy(line[0], line, 60.9)
+    assert is_noisy(line[0], line, 61.1)
 
 
 def test_a_restart_needs_a_resync_and_keeps_the_outstanding_request() -> None:

@@ -9,6 +9,7 @@ from gateway.engine.effects import Pause
 from gateway.engine.jobs.jobs import (
     Confirm,
     HeldTogether,
+    Probe,
     ReadBack,
     Repeat,
     Result,
@@ -198,17 +199,50 @@ def test_writes_refused_together_before_any_was_done_are_sent_alone_in_their_ord
         sent.append(job)
         rig.conclude(job, OK if isinstance(job, Write) else [0] * 6)
     assert [job for job in sent if isinstance(job, Write)] == writes
-    assert all(write.alone for write in writes)
+    assert all(write.refused is DAMAGED for write in writes)
 
 
-def test_a_write_refused_together_that_expires_was_refused_and_not_sent_alone() -> None:
+@pytest.mark.parametrize(
+    ("how", "after"),
+    [
+        ("expires", "waited 5.0 s for the line; not sent"),
+        ("offline", "plc1 does not answer; nothing was sent"),
+        ("lost", "line line: unplugged; not sent"),
+        ("stops", "line line went down; not sent"),
+        ("not sent", "not now"),
+        ("fails before its first byte", "noise"),
+    ],
+)
+def test_a_write_refused_together_that_is_not_sent_alone_was_refused(how: str, after: str) -> None:
+    """ "Nothing was sent" is not the end of what was sent once."""
     rig = online()
     writes = [rig.write("D0"), rig.write("D1")]
     rig.conclude(rig.transacted(), DAMAGED)
-    rig.now += WRITE_EXPIRY
-    rig.note(rig.engine.expire(rig.now, rig.time))
+    match how:
+        case "expires":
+            rig.now += WRITE_EXPIRY
+            rig.note(rig.engine.expire(rig.now, rig.time))
+        case "lost":
+            rig.note(rig.engine.lost(LOST, rig.now, rig.time))
+        case "stops":
+            rig.note(rig.engine.stopped(rig.now))
+        case "offline":
+            while not rig.outcomes:
+                rig.fail(rig.transacted())
+        case _:
+            refused: dict[type[Transacted], tuple[Result, Traffic | None]] = {
+                Write: (Busy("not now"), None) if how == "not sent" else (NOISE, Traffic()),
+                Settle: (Settled(None), None),
+                Probe: (Resynced(1), None),
+            }
+            while len(rig.outcomes) < len(writes):
+                job = rig.transacted()
+                rig.conclude(job, *refused.get(type(job), ([0] * 6, None)))
     for write in writes:
-        assert str(rig.outcomes[write]).endswith("refused together with others, and not sent alone")
+        outcome = rig.outcomes[write]
+        assert isinstance(outcome, Refused)
+        assert (outcome.code, outcome.unexecuted) == (DAMAGED.code, True)
+        assert str(outcome) == f"{DAMAGED}; after that: {after}"
 
 
 @pytest.mark.parametrize(

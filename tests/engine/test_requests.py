@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.engine.device.device import Device
-from gateway.errors import BadValue, Busy, LineDown, Offline, Refused, Unclear
+from gateway.errors import BadValue, Busy, LineDown, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.vigor import Vigor
 from gateway.tags import WriteResult, WriteRule
@@ -256,8 +256,8 @@ async def test_a_refused_group_is_not_sent_on_to_a_device_that_went_offline() ->
         station.mute = True
         await asyncio.sleep(5)
         assert isinstance(outcomes["M0"].once, Unclear)
-        assert isinstance(outcomes["M21"].once, Offline)
-        assert isinstance(outcomes["M42"].once, Offline)
+        for name in ("M21", "M42"):  # both were sent once
+            assert str(outcomes[name].once).startswith("station 5 answered NAK 02")
         assert commands(station).count("BW") == 1
 
 

@@ -74,7 +74,9 @@ class Bus:
     request: bytes = b""  # as it reached the stations
     own: list[bytes] = field(default_factory=list)  # replies of its stations since then
     writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
-    carried: Counter[int] = field(default_factory=Counter)  # at most so many of transfers, or twice
+    # At most so many of these are of transfers that began, and of those that ended.
+    carrying: Counter[int] = field(default_factory=Counter)
+    carried: Counter[int] = field(default_factory=Counter)
     commands: Counter[int] = field(default_factory=Counter)
     misled: set[str] = field(default_factory=set)  # that accepted a damaged monitor list
     questions: deque[tuple[float, Asked]] = field(default_factory=lambda: deque(maxlen=64))

@@ -60,9 +60,13 @@ class Client:
     def number(self) -> int:
         return self.bus.number_of(self.device)
 
-    def sent(self) -> int:
-        """Counts the write frames to the device; transfers may have sent more."""
+    def mark(self) -> int:
+        """Returns a mark for `sent`: the write frames to the device until now."""
         return self.bus.writes[self.number] - self.bus.carried[self.number]
+
+    def sent(self, mark: int) -> int:
+        """Counts the write frames since the mark, less those that transfers may have sent."""
+        return max(0, self.bus.writes[self.number] - self.bus.carrying[self.number] - mark)
 
     def blind(self, what: str) -> None:
         count = what if summed(self.device) else f"{what} without a sum"
@@ -110,14 +114,14 @@ class Client:
 
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
         """Writes several tags at once: in one frame, or one by one after a refusal."""
-        frames, since = self.sent(), self.judge.now
+        mark, since = self.mark(), self.judge.now
         most = sum(most_requests(tag) for tag, _ in writes)
         most += len(writes) > 1
         if self.device.broadcast:
             await asyncio.gather(*(self._tell_all(tag, value) for tag, value in writes))
         else:
             await asyncio.gather(*(self._write_one(t, v, len(writes) > 1) for t, v in writes))
-        sent = max(0, self.sent() - frames)
+        sent = self.sent(mark)
         if sent > most:
             self.judge.broke(f"{self.device.name}: {len(writes)} writes were sent {sent} times")
         if self.bus.hurt_at < since:
@@ -125,11 +129,11 @@ class Client:
 
     async def _write_one(self, tag: Tag, value: Value, beside_others: bool) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
-        frames, since = self.sent(), judge.now
+        mark, since = self.mark(), judge.now
         known = counts(station, tag)
         held = shown(tag, station.holds(tag))
         outcome = await self._outcome(tag, value)
-        sent = max(0, self.sent() - frames)
+        sent = self.sent(mark)
         bus.note("outcome", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"write {type(outcome).__name__}"] += 1
         obeyed = times(station, tag, known)
@@ -200,9 +204,9 @@ class Client:
 
     async def _tell_all(self, tag: Tag, value: Value) -> None:
         judge, bus = self.judge, self.bus
-        frames, since = self.sent(), judge.now
+        mark, since = self.mark(), judge.now
         outcome = await self._outcome(tag, value)
-        sent = max(0, self.sent() - frames)
+        sent = self.sent(mark)
         bus.note("told all", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"broadcast {type(outcome).__name__}"] += 1
         if isinstance(outcome, WriteResult) and outcome.acknowledged:

@@ -17,7 +17,7 @@ async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag
     device, judge, bus = client.device, client.judge, client.bus
     tags = written_by_clients(device.tags)
     writes, station = _larger(few, tags, chance), judge.stations[device.name]
-    frames, since = client.sent(), judge.now
+    mark, since = client.mark(), judge.now
     known = [counts(station, tag) for tag, _ in writes]
     held = [shown(tag, station.holds(tag)) for tag, _ in writes]
     ends: Sequence[WriteResult | GatewayError]
@@ -25,7 +25,7 @@ async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag
         ends = await judge.gateway.write_group(writes, 5.0, 60.0)
     except GatewayError as error:
         ends = [error] * len(writes)
-    sent = max(0, client.sent() - frames)
+    sent = client.sent(mark)
     bus.note("group", device.name, [type(end).__name__ for end in ends], sent)
     judge.story.counts["groups"] += 1
     judge.story.counts["groups done"] += all(isinstance(end, WriteResult) for end in ends)

@@ -96,7 +96,7 @@ class Carrier:
         station, since = judge.stations[tag.device], judge.now
         read_at = judge.read_at.get(row.source, since)
         known, held = counts(station, tag), shown(tag, station.holds(tag))
-        self._count(tag)
+        self._count(tag, self.buses[tag.device].carrying)
         row.writing, before = True, (row.written, row.at, row.sure, row.instead)
         row.written, row.at, row.sure, row.instead = value, since, False, not fresh
         row.early = early
@@ -104,7 +104,7 @@ class Carrier:
             end: WriteResult | GatewayError = await self._plain(tag, value, by, within)
         except GatewayError as error:
             end = error
-        self._count(tag)  # it began before, or ends after what a client looks at
+        self._count(tag, self.buses[tag.device].carried)
         row.writing, row.sure = False, isinstance(end, WriteResult)
         if isinstance(end, (*NOT_SENT, Refused, BadValue)):
             row.written, row.at, row.sure, row.instead = before
@@ -120,10 +120,9 @@ class Carrier:
             raise end
         return end
 
-    def _count(self, tag: Tag) -> None:
-        device, bus = self.devices[tag.device], self.buses[tag.device]
-        client = Client(device, self.judge, bus, _NO_CHANCE, 1.0)
-        bus.carried[client.number] += most_requests(tag)
+    def _count(self, tag: Tag, counter: Counter[int]) -> None:
+        number = self.buses[tag.device].number_of(self.devices[tag.device])
+        counter[number] += most_requests(tag)
 
     def _fresh(self, row: _Row) -> bool:
         sample = self.judge.gateway.mirror[row.source]

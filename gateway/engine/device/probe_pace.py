@@ -51,9 +51,9 @@ class ProbePace:
         """Returns True if damaged replies of the device arrived a short time ago."""
         return now - self._last_bytes < ALIVE_FOR
 
-    def is_noisy(self, now: float) -> bool:
-        """Returns True if its replies are damaged on the way, and did not come late for long."""
-        return self.is_alive(now) and now - self._last_late >= LATE_FOR
+    def was_late(self, now: float) -> bool:
+        """Returns True if a reply of the device came late in the last minute."""
+        return now - self._last_late < LATE_FOR
 
     def spoke(self, now: float, longest_reply: float) -> None:
         """Notes a sound frame while it was offline: it replies later than a short probe waits."""

@@ -9,6 +9,7 @@ from gateway.engine.device.reply_shapes import ReplyShapes
 from gateway.engine.jobs.jobs import WriteTogether
 from gateway.engine.jobs.requests import Command, Group, Request, Resyncs, Write
 from gateway.engine.jobs.runs import needs_read, run_of, together
+from gateway.errors import Refused
 from gateway.protocols.capabilities import ScatteredWriter
 from gateway.protocols.driver import Span
 
@@ -115,10 +116,10 @@ class RequestQueue:
         self._out(lambda request: request in others)
         return WriteTogether(write.device, writes[:count], run)
 
-    def each_alone(self, writes: Sequence[Write]) -> None:
+    def each_alone(self, writes: Sequence[Write], refused: Refused) -> None:
         """Puts back writes of which none was done: now one by one."""
         for write in reversed(writes):
-            write.send_alone()
+            write.send_alone(refused)
             self.waiting.appendleft(write)
 
     def withdraw(self, device: Device | None = None) -> list[Request]:

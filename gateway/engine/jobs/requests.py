@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.long_writes import LongWrite, long_write, writes_around
-from gateway.errors import GatewayError, NotSent
+from gateway.errors import GatewayError, NotSent, Refused
 from gateway.protocols.capabilities import Controllable
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.tags import Tag, WriteResult
@@ -71,7 +71,7 @@ class Write:
     units: Sequence[int]
     submitted: float
     within: float = WRITE_EXPIRY
-    alone: bool = False  # refused together with others before any was done: now sent alone
+    refused: Refused | None = None  # before it was done, sent otherwise: now it is sent alone
     resyncs: Resyncs = NO_RESYNCS
     group: Group | None = None
     masked: bool = False  # the device changes the bits of its word by itself
@@ -95,9 +95,9 @@ class Write:
         """The time after which it is not sent, because the client no longer waits."""
         return self.submitted + self.within
 
-    def send_alone(self) -> None:
-        """Notes that none of the writes that it shared a request with was done."""
-        self.alone = True
+    def send_alone(self, refused: Refused) -> None:
+        """Notes a refusal before it was done: together with others, or by its bits."""
+        self.refused = refused
 
     def mask(self, *, masked: bool) -> None:
         """Has the device change the bits of the word by itself, or not."""
@@ -108,7 +108,7 @@ class Write:
         """True if one request is enough, which it can share with other writes."""
         rule = self.tag.write
         needs_more = rule is not None and (rule.verify or rule.repeat)
-        return not (self.alone or needs_more) and self.part is None
+        return not (self.refused or needs_more) and self.part is None
 
     @property
     def latest(self) -> bool:
@@ -155,9 +155,19 @@ class Command:
 Request = Write | Command
 
 
-def after_failed(group: Group) -> NotSent:
-    """Returns the outcome of the writes that follow one that was not done."""
-    return NotSent(f"not sent, because {group.failed} before it failed")
+def after_failed(write: Write, group: Group) -> NotSent:
+    """Returns the outcome of a write that follows one of its group that was not done."""
+    sent = "refused together with others, and not sent alone" if write.refused else "not sent"
+    return NotSent(f"{sent}, because {group.failed} before it failed")
+
+
+def unsent(request: Request, why: GatewayError) -> GatewayError:
+    """Returns the outcome of a request that is not sent, or not again after a refusal."""
+    if not isinstance(request, Write) or (refused := request.refused) is None:
+        return why
+    return Refused(
+        f"{refused}; after that: {why}", code=refused.code, refusal=refused.refusal, unexecuted=True
+    )
 
 
 def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:

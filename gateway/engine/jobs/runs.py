@@ -47,7 +47,7 @@ def run_of(writes: Sequence[Write]) -> tuple[int, Span]:
 
 def _may_share(write: Write) -> bool:
     tag, rule = write.tag, write.tag.write
-    if write.alone or tag.origin.shape is not None or (rule is not None and rule.repeat):
+    if write.refused or tag.origin.shape is not None or (rule is not None and rule.repeat):
         return False
     return not any(bad.overlaps(tag.span) for bad in write.device.bad_addresses.bad)
 

@@ -36,7 +36,7 @@ class BitWrites(Rule):
             driver, device = job.device.driver, job.device
             may = isinstance(driver, ChangesBits) and driver.changes_bits(job.tag.span)
             known = self._lacked_until.get(device, 0.0) <= now
-            job.mask(masked=may and known and not job.alone)
+            job.mask(masked=may and known and not job.refused)
 
     def concluded(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int

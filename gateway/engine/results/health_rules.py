@@ -8,6 +8,7 @@ from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.effects import Effects
 from gateway.engine.results.staleness import Staleness
 from gateway.engine.schedule.in_flight import InFlight
+from gateway.engine.schedule.probes import is_noisy
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import DeviceError, Offline
 from gateway.protocols.driver import Span
@@ -123,7 +124,11 @@ class HealthRules:
             self._effects.online(device, False)
             self._effects.warning("device offline", device=device.name, why=why)
         for request in self._schedule.requests.withdraw(device):
-            self._effects.ended(request, offline(device))
+            self._effects.unsent(request, offline(device))
+
+    def is_noisy(self, device: Device, now: float) -> bool:
+        """Returns True if replies of the device are damaged on the way."""
+        return is_noisy(device, self._schedule.devices, now)
 
     def spoke(self, device: Device, now: float) -> None:
         """Applies a sound frame of a device, which no request waits for."""

@@ -74,7 +74,7 @@ class Identities(Rule):
             self._effects.bad(device.polled_tags, Reason.WRONG_DEVICE, time, identity.why)
         if not identity.takes_requests:
             for request in self._schedule.requests.withdraw(device):
-                self._effects.ended(request, wrong_device(device))
+                self._effects.unsent(request, wrong_device(device))
 
     def _applied(self, identity: Identity, result: Result, now: float) -> None:
         match result:

@@ -220,7 +220,7 @@ class NextJob:
         self._release(now, time, proven=False)
         known = isinstance(job, Poll) or (isinstance(job, Probe) and job.token != PROOF)
         before = self._results.unclear(device, error, span_of(job), now, time, known=known)
-        no_guard = before is State.OFFLINE or _is_short(job) or _is_lost(job, error, now)
+        no_guard = before is State.OFFLINE or _is_short(job) or self._is_lost(job, error, now)
         settle = Settle(
             device,
             0.0 if no_guard else device.settings.late_guard,
@@ -231,6 +231,15 @@ class NextJob:
             sent=traffic.sent > 0,
         )
         self._in_flight.follow(settle)
+
+    def _is_lost(self, job: Unfinished, error: DeviceError, now: float) -> bool:
+        """Returns True if noise has likely destroyed the reply: waiting for a late one is no use.
+
+        The resync that follows is safe without the wait: its reply differs. A write keeps the wait,
+        for the late reply tells its outcome.
+        """
+        polled = isinstance(error, NoReply) and isinstance(job, Poll | Probe)
+        return polled and job.device.shapes is not None and self._results.is_noisy(job.device, now)
 
     def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
         device, after = settle.device, settle.after
@@ -275,17 +284,6 @@ def _is_suspect(poll: Poll) -> bool:
     """Returns True if the device may be silent about an address of the poll."""
     longer = poll.span is not poll.block.span
     return longer or poll.device.bad_addresses.is_suspect(poll.block)
-
-
-def _is_lost(job: Unfinished, error: DeviceError, now: float) -> bool:
-    """Returns True if noise has likely destroyed the reply: waiting for a late one is no use.
-
-    The resync that follows is safe without the wait: its reply differs. A write keeps the wait, for
-    the late reply tells its outcome.
-    """
-    device = job.device
-    polled = isinstance(error, NoReply) and isinstance(job, Poll | Probe)
-    return polled and device.shapes is not None and device.health.probes.is_noisy(now)
 
 
 def _is_short(job: Unfinished) -> bool:

@@ -2,7 +2,6 @@
 
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.request_queue import RequestQueue
-from gateway.engine.jobs.requests import Write
 from gateway.engine.results.rule import NEVER, Rule
 from gateway.errors import Busy
 
@@ -20,7 +19,5 @@ class RequestExpiry(Rule):
 
     def tick(self, now: float, time: int) -> None:
         for request in self._requests.expired(now):
-            waited = f"waited {now - request.submitted:.1f} s for the line"
-            refused = isinstance(request, Write) and request.alone
-            sent = "refused together with others, and not sent alone" if refused else "not sent"
-            self._effects.ended(request, Busy(f"{waited}; {sent}"))
+            waited = now - request.submitted
+            self._effects.unsent(request, Busy(f"waited {waited:.1f} s for the line; not sent"))

@@ -29,6 +29,7 @@ from gateway.engine.jobs.requests import (
     Request,
     Write,
     after_failed,
+    unsent,
 )
 from gateway.engine.jobs.runs import own_units, verified
 from gateway.engine.results.health_rules import HealthRules
@@ -100,10 +101,9 @@ class RequestRules:
                     return self._confirm(device, writes, run, error)
             case ReadBack(error=first) | Confirm(error=first) | Repeat(error=first):
                 error = first
-        unsent = not settle.sent and not isinstance(job, ReadBack | Confirm | Repeat)
-        outcome = Busy(str(error)) if unsent else error
+        sent = settle.sent or isinstance(job, ReadBack | Confirm | Repeat)
         for request in requests_of(job):
-            self._end(request, outcome, now)
+            self._end(request, error if sent else unsent(request, Busy(str(error))), now)
         return None
 
     def _confirm(
@@ -126,18 +126,22 @@ class RequestRules:
     def _unsent(self, job: RequestJob, why: Busy, now: float) -> None:
         """Ends the requests of a job that the line did not send."""
         for request in requests_of(job):  # a repetition says nothing about the first try
-            self._end(request, job.error if isinstance(job, Repeat) else why, now)
+            outcome = job.error if isinstance(job, Repeat) else unsent(request, why)
+            self._end(request, outcome, now)
 
     def _single(self, write: Write, result: Result, now: float, time: int) -> None:
         """Ends a write, or has it sent the other way where the device lacks the first one."""
-        # Other refusals, such as a fault of the device, do not tell that it changed nothing.
-        refused = isinstance(result, Refused) and (
-            result.refusal is Refusal.ADDRESS
-            or (result.unexecuted and result.refusal is not Refusal.BUSY)
-        )
         outcome = self._written(write, result, None, now, time)
-        if write.masked and refused:
-            self._schedule.requests.each_alone((write,))
+        # Other refusals, such as a fault of the device, do not tell that it changed nothing.
+        if (
+            write.masked
+            and isinstance(result, Refused)
+            and (
+                result.refusal is Refusal.ADDRESS
+                or (result.unexecuted and result.refusal is not Refusal.BUSY)
+            )
+        ):
+            self._schedule.requests.each_alone((write,), result)
         else:
             self._end(write, outcome, now)
 
@@ -171,7 +175,7 @@ class RequestRules:
             self._refused(job.device, result, now, time)
             if not result.unexecuted:
                 return ReadBack(job.device, job.writes, result, job.run)
-            self._schedule.requests.each_alone(job.writes)
+            self._schedule.requests.each_alone(job.writes, result)
             return None
         if not isinstance(result, Sent):
             raise TypeError(f"{result!r} is no result of a write")
@@ -280,7 +284,7 @@ class RequestRules:
     def _end_group(self, group: Group) -> None:
         """Ends the waiting writes of a group: they must not follow one that was not done."""
         for waiting in self._schedule.requests.of_group(group):
-            self._effects.ended(waiting, after_failed(group))
+            self._effects.collected.append(RequestEnded(waiting, after_failed(waiting, group)))
             poll = self._schedule.reader(waiting.device, waiting.tag)
             if poll is not None:
                 self._schedule.expedite(poll)  # it has tags that were written before

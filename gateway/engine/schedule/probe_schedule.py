@@ -11,6 +11,7 @@ from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
     PATIENT_AFTER,
     brief_timeout,
+    is_noisy,
     order_of_start,
     probe_seconds,
     short_timeout,
@@ -104,7 +105,7 @@ class ProbeSchedule:
         its replies: one that has not come by then does not come."""
         health, timeout, brief = device.health, None, None
         starting = health.state is State.STARTING and not health.probes.short
-        if health.probes.is_noisy(now) and health.probes.short < PATIENT_AFTER:
+        if is_noisy(device, self._devices, now) and health.probes.short < PATIENT_AFTER:
             timeout = brief_timeout(device)
         elif not patient and (starting or health.state is State.OFFLINE):
             timeout = short_timeout(device, self._devices)

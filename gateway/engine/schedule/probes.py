@@ -54,6 +54,15 @@ def _may_be_short(device: Device) -> bool:
     return traits.numbered and not traits.over_network
 
 
+def is_noisy(device: Device, devices: Sequence[Device], now: float) -> bool:
+    """Returns True if replies of the device are damaged on the way.
+
+    Where a device of the line replied late, they may have met that reply: its own may be late, too.
+    """
+    late = any(other.health.probes.was_late(now) for other in devices)
+    return device.health.probes.is_alive(now) and not late
+
+
 def probe_seconds(device: Device, timeout: float | None = None) -> float:
     """Returns the seconds of an unanswered probe. `timeout` None: a patient one."""
     wait = device.timing.reply_timeout if timeout is None else timeout
