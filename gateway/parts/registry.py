@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gateway.plant.part import Kind
 
 PARTS = (
-    *("history", "audit", "state", "serving", "sharing", "transfers", "alarms"),
+    *("history", "audit", "state", "serving", "doors", "transfers", "alarms"),
     *("certificates", "damaged_files", "web"),
 )
 

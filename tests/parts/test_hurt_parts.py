@@ -145,7 +145,7 @@ POINTS = {
     "audit": ("run", "documents"),
     "state": ("run",),
     "serving": ("run", "seen", "documents"),
-    "sharing": ("run", "documents", "take_over"),
+    "doors": ("run", "documents", "take_over"),
     "transfers": ("run", "publish", "documents", "take_over"),
     "alarms": ("run", "seen", "documents", "retag", "take_over"),
     "damaged_files": ("run", "documents"),

@@ -20,11 +20,11 @@ from gateway.contract.keys import Keys
 from gateway.line.opening import OpenPort
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
-from gateway.parts.sharing.guest import Guest
-from gateway.parts.sharing.guest_requests import GuestRequests
-from gateway.parts.sharing.open_door import OpenDoor
-from gateway.parts.sharing.settings import Sharing
-from gateway.parts.sharing.tunnel import Tunnel
+from gateway.parts.doors.guest import Guest
+from gateway.parts.doors.guest_requests import GuestRequests
+from gateway.parts.doors.open_door import OpenDoor
+from gateway.parts.doors.settings import Sharing
+from gateway.parts.doors.tunnel import Tunnel
 from gateway.plant.plant import Plant
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.rtu import encode

@@ -36,7 +36,7 @@ ROOMS = {
     "tags": "tags engine northbound",
     "protocols": "protocols line",
     "parts/alarms": "alarms",
-    "parts/sharing": "sharing",
+    "parts/doors": "doors",
     "parts/transfers": "transfers",
     "contract/access/writers.py": "northbound",
     "northbound/group": "northbound",

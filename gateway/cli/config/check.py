@@ -18,8 +18,8 @@ from gateway.config.loading import written
 from gateway.config.messages import dotted
 from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
+from gateway.parts.doors.plan import door_plans, door_warnings
 from gateway.parts.history.store.place import trouble
-from gateway.parts.sharing.plan import door_plans, door_warnings
 from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
 from gateway.parts.web import exposure
 from gateway.planning.planner import describe

@@ -15,13 +15,13 @@ from gateway.config.messages import ConfigErrors
 from gateway.contract.keys import Keys
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
-from gateway.parts.sharing.guest import MOST_WAITING, Guest
-from gateway.parts.sharing.guest_requests import GuestRequests
-from gateway.parts.sharing.open_door import OpenDoor
-from gateway.parts.sharing.plan import door_plans, door_warnings
-from gateway.parts.sharing.settings import Sharing
-from gateway.parts.sharing.stores import Step
-from gateway.parts.sharing.tunnel import Tunnel
+from gateway.parts.doors.guest import MOST_WAITING, Guest
+from gateway.parts.doors.guest_requests import GuestRequests
+from gateway.parts.doors.open_door import OpenDoor
+from gateway.parts.doors.plan import door_plans, door_warnings
+from gateway.parts.doors.settings import Sharing
+from gateway.parts.doors.stores import Step
+from gateway.parts.doors.tunnel import Tunnel
 from gateway.parts.transfers.forecast import forecasts
 from gateway.plant.plant import Plant
 from gateway.protocols.driver import Span

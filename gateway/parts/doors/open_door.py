@@ -12,10 +12,10 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import LineDown
 from gateway.line.line import Line
 from gateway.line.opening import Pauses
-from gateway.parts.sharing.guest import Guest
-from gateway.parts.sharing.guest_requests import GuestRequests
-from gateway.parts.sharing.settings import RAW, Door
-from gateway.parts.sharing.tunnel import Tunnel
+from gateway.parts.doors.guest import Guest
+from gateway.parts.doors.guest_requests import GuestRequests
+from gateway.parts.doors.settings import RAW, Door
+from gateway.parts.doors.tunnel import Tunnel
 from gateway.plant.plant import Plant
 from gateway.stations.served.answering import Answerer, Answering, Wire
 from gateway.stations.served.echo import Echo

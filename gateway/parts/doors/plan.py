@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from gateway.config import Config
 from gateway.engine.forecast import LineForecast
-from gateway.parts.sharing.settings import RAW, Door, Sharing
+from gateway.parts.doors.settings import RAW, Door, Sharing
 from gateway.protocols.driver import Address, AnyDriver, Span
 
 

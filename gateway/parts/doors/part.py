@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 
 from gateway.config import Config
 from gateway.contract.documents.state import DoorDocument
-from gateway.parts.sharing.guest_requests import GuestRequests
-from gateway.parts.sharing.open_door import OpenDoor
-from gateway.parts.sharing.settings import Sharing
+from gateway.parts.doors.guest_requests import GuestRequests
+from gateway.parts.doors.open_door import OpenDoor
+from gateway.parts.doors.settings import Sharing
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.tags import Tag
 

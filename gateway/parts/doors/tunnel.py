@@ -10,12 +10,12 @@ import structlog
 from gateway.contract.documents.requests import OutcomeDocument
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
-from gateway.parts.sharing.guest import MOST_WAITING, guest_document
+from gateway.parts.doors.guest import MOST_WAITING, guest_document
 from gateway.tags.timestamps import rfc3339
 from gateway.transport import Port
 
 if TYPE_CHECKING:
-    from gateway.parts.sharing.open_door import OpenDoor
+    from gateway.parts.doors.open_door import OpenDoor
 
 log = structlog.get_logger("gateway.line")
 HAND_OVER = 20.0  # seconds: the line ends its transaction, and closes a port that may be slow

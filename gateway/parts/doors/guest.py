@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
-from gateway.parts.sharing.guest_requests import NOT_NOW, Unanswered
-from gateway.parts.sharing.stores import Needs, Outcomes, Step
+from gateway.parts.doors.guest_requests import NOT_NOW, Unanswered
+from gateway.parts.doors.stores import Needs, Outcomes, Step
 from gateway.stations.served.answering import Heard
 from gateway.transport import Port
 
 if TYPE_CHECKING:
-    from gateway.parts.sharing.open_door import OpenDoor
+    from gateway.parts.doors.open_door import OpenDoor
 
 MOST_WAITING = 4096  # bytes of requests; a program that sends more is disconnected
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from gateway.contract.interfaces import North
 from gateway.engine.forecast import write_seconds
 from gateway.errors import BadValue, Busy, GatewayError, Refused
-from gateway.parts.sharing.settings import Door
-from gateway.parts.sharing.stores import Step
+from gateway.parts.doors.settings import Door
+from gateway.parts.doors.stores import Step
 from gateway.plant.any_address import AnyAddress
 from gateway.stations.store import Cell, Denied, Rejected, Why
 
