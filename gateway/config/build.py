@@ -15,6 +15,7 @@ from gateway.config.settings.records import Config, LineConfig
 from gateway.config.settings.sections import Place, file_section, placed
 from gateway.config.settings.validate import driver_of, driver_settings, protocols, section, unknown
 from gateway.config.settings.zenoh_records import existing_file, with_files
+from gateway.config.sheets import Grid
 from gateway.config.sheets.tags import SheetTags
 from gateway.config.tags.computed import check_totals, with_computed
 from gateway.config.tags.device_tags import DeviceTags, mapping
@@ -55,7 +56,8 @@ class Builder:
     folder: FilePath
     state_folder: FilePath | None = None
     report: Callable[[float], None] | None = None  # receives the share of the devices that is built
-    imports: Mapping[str, FilePath] = field(default_factory=dict)  # one more sheet of a device
+    # one more sheet of a device, which is read already
+    imports: Mapping[str, tuple[FilePath, Grid]] = field(default_factory=dict)
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
     _count: int = 0  # devices in the file
     _intervals: dict[str, float] = field(default_factory=dict)  # by device: the default
@@ -64,7 +66,7 @@ class Builder:
 
     def __post_init__(self) -> None:
         self._tags = DeviceTags(self.mistakes)
-        self._sheets = SheetTags(self.mistakes, self.folder)
+        self._sheets = SheetTags(self.mistakes, self.folder, grids=dict(self.imports.values()))
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """Returns the whole file; None, after mistakes, where no part could be made."""
@@ -195,7 +197,7 @@ class Builder:
         )
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
-        for sheet in filter(None, (own_sheet, self.imports.get(name))):
+        for sheet in filter(None, (own_sheet, self.imports.get(name, (None,))[0])):
             place, taken = (*path, "tags_from"), {tag.name for tag in tags}
             tags += self._sheets.build(
                 name, sheet, place, defaults, addressing, taken, not_real=not_real

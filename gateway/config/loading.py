@@ -16,6 +16,7 @@ from gateway.config.build import Builder
 from gateway.config.messages import Mistakes, OptionPlaces
 from gateway.config.settings.records import Config
 from gateway.config.settings.sections import Written, reads, writes
+from gateway.config.sheets import Grid
 from gateway.config.templates.expand import expanded
 from gateway.config.yaml.file import TEXTS, read_yaml
 from gateway.config.yaml.scalars import scalar
@@ -26,7 +27,7 @@ STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
 def load(
     path: str | Path,
     report: Callable[[str, float], None] | None = None,
-    imports: Mapping[str, Path] | None = None,
+    imports: Mapping[str, tuple[Path, Grid]] | None = None,
 ) -> Config:
     """Reads and checks the file. Paths in it are relative to its folder; those of files that the
     gateway writes are relative to `state_folder()`, if there is one.
@@ -57,10 +58,17 @@ def expanded_text(path: str | Path) -> str:
     return dumped(data)
 
 
-def built(data: Mapping[str, object], folder: Path | None = None) -> Config:
-    """Returns the configuration of data that is in no file. Raises `ConfigErrors`."""
+def built(
+    data: Mapping[str, object],
+    folder: Path | None = None,
+    imports: Mapping[str, tuple[Path, Grid]] | None = None,
+) -> Config:
+    """Returns the configuration of data that is in no file. `imports`: as in `load`.
+
+    Raises `ConfigErrors`.
+    """
     mistakes = Mistakes(OptionPlaces())
-    config = Builder(mistakes, folder or Path()).config(data)
+    config = Builder(mistakes, folder or Path(), imports=imports or {}).config(data)
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{data}: no configuration, and no mistake either")

@@ -194,7 +194,7 @@ def test_a_sheet_of_several_devices_gives_each_its_rows() -> None:
         (b"", "the sheet is empty"),
         (b"a;b\n1;2\n", "no row with titles of columns"),
         (b'Name;Address\n"x;D1\n', "row 2: a quote"),
-        (b"\xd0\xcf\x11\xe0 old", "an old Excel file"),
+        (b"\xd0\xcf\x11\xe0 old", "no .xls file, or damaged"),
         (b"PK\x03\x04 no archive", "no .xlsx file, or damaged"),
         (b"\xff\xfeN", "the file is damaged"),
     ],

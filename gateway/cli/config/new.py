@@ -13,7 +13,7 @@ from gateway.cli.config.check import check, size
 from gateway.cli.line import scan as scanning
 from gateway.cli.line.scan import Found
 from gateway.cli.line.scan_command import BaudOption, FormatOption, TimeoutOption, scanned
-from gateway.cli.sheets.import_command import add_tags
+from gateway.cli.sheets.import_command import add_tags, write_new
 from gateway.cli.terminal import err
 from gateway.config import load
 from gateway.config.messages import one_of
@@ -96,11 +96,7 @@ def new(
     sheets = _sheets(tags, [device.name for device in devices])
     behind = baud if baud is not None and baud.isdecimal() else None
     text = document(gateway_name, line_name, port, devices, every, behind)
-    try:
-        with file.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-    except OSError as error:
-        raise ConfigError(f"{file} cannot be written: {error.strerror}") from None
+    write_new(file, text)
     print(f"{file}: written")
     for sheet, wanted in sheets:
         _import(sheet, file, wanted)
@@ -219,7 +215,9 @@ def _sheets(given: list[str] | None, devices: Sequence[str]) -> list[tuple[Path,
 def _asked_sheet(device: str) -> list[Path]:
     """Returns the sheet that a person names for a device, or nothing."""
     while True:
-        file = _asked("tags", f"Sheet with the tags of {device} (CSV, .xlsx)", None, "none")
+        file = _asked(
+            "tags", f"Sheet with the tags of {device} (CSV, .xlsx, .xls, .ods)", None, "none"
+        )
         if file == "none":
             return []
         if Path(file).is_file():

@@ -1,10 +1,10 @@
 """The `import` command: tags of a sheet into the configuration, all or none."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,7 +12,7 @@ from gateway.cli.terminal import err
 from gateway.config import Config, ConfigErrors, SheetUse, built, load
 from gateway.config.loading import dumped
 from gateway.config.messages import one_of
-from gateway.config.sheets import devices_in, link_table, read_grid
+from gateway.config.sheets import Grid, adapted, cells, devices_in, link_table, read_grid
 from gateway.config.sheets.link_table import Transferred
 from gateway.config.sheets.tags import native, preview
 from gateway.config.yaml.file import read_yaml
@@ -21,7 +21,11 @@ from gateway.errors import ConfigError
 from gateway.tags import Tag
 
 SheetPath = Annotated[
-    Path, typer.Argument(metavar="SHEET", help="CSV, tab-separated text or .xlsx; with titles.")
+    Path,
+    typer.Argument(
+        metavar="SHEET",
+        help="CSV, text, .xlsx, .xls or .ods with titles, or a project of another program.",
+    ),
 ]
 
 
@@ -33,6 +37,17 @@ def import_(
     device: Annotated[
         str | None, typer.Option(help="The device in that file (default: its only one)")
     ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SETTING=TITLE", help="The column of a setting: name=Bezeichnung"),
+    ] = None,
+    address: Annotated[
+        list[str] | None,
+        typer.Option(metavar="OLD=NEW", help="How addresses begin there, and here: %MW=holding:"),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, and write nothing.")
+    ] = False,
     transfers: Annotated[
         str | None,
         typer.Option(
@@ -57,29 +72,69 @@ def import_(
     if transfers is not None:
         import_transfers(sheet, into, transfers)
         return
-    grid = read_grid(read_file(sheet))
+    grid = adapted(read_grid(read_file(sheet)), _pairs(columns), _pairs(address))
     named = [] if link_table.is_table(grid) else devices_in(grid)
+    lines = grid.project.lines if grid.project is not None else {}
+    if into is None and lines and not device:
+        print(_plant(sheet, grid, lines), end="")
+        return
     if into is None:
         tags, notes = preview(sheet, grid, device or (named[0] if len(named) == 1 else ""))
         print_notes(sheet, notes)
         print("tags:", *(f"  {entry(name, raw)}" for name, raw in tags.items()), sep="\n")
         err.print("addresses and limits are not checked yet: name the file with --into")
         return
-    for line in add_tags(sheet, into, [device] if device else named):
+    if lines and not into.exists():
+        text = _plant(sheet, grid, lines)
+        if not dry_run:
+            write_new(into, text)
+        said = [f"{into.name}: {len(grid.rows) - 1} tags of {sheet.name} on {len(lines)} lines"]
+    else:
+        said = add_tags(sheet, into, [device] if device else named, grid=grid, dry_run=dry_run)
+    for line in [*said, "nothing was written: --dry-run"] if dry_run else said:
         print(line)
 
 
-def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True) -> list[str]:
+def _pairs(options: Sequence[str] | None) -> dict[str, str]:
+    """Raises `ConfigError`."""
+    found = dict(one.partition("=")[::2] for one in options or ())
+    if not all(found.values()):
+        raise ConfigError("--columns and --address have two sides: name=Bezeichnung, %MW=holding:")
+    return found
+
+
+def _plant(sheet: Path, grid: Grid, lines: Mapping[str, Any]) -> str:
+    """Returns a project as a file of its own. Raises `ConfigErrors`."""
+    data = {"gateway": {"name": cells.name(sheet.stem)}, "lines": lines}
+    devices = {name: one for line in lines.values() for name, one in line["devices"].items()}
+    imports = {device: (sheet.absolute(), grid) for device in devices}
+    uses = built(data, imports=imports).sheets
+    for use in uses:
+        devices[use.device]["tags"] = dict(use.raw)
+    print_notes(sheet, uses[0].notes)
+    return dumped(data)
+
+
+def add_tags(
+    sheet: Path,
+    into: Path,
+    devices: list[str],
+    *,
+    backup: bool = True,
+    grid: Grid | None = None,
+    dry_run: bool = False,
+) -> list[str]:
     """Adds the tags of a sheet to the file. Returns sentences about it.
 
-    `backup`: the file as it was stays beside it.
+    `backup`: the file as it was stays beside it. `grid`: the sheet, if it was read.
 
     Raises `ConfigErrors` with every mistake; then the file is as before.
     """
-    devices = devices or _devices_of_table(sheet, into) or _only_device(into)
+    grid = grid or read_grid(read_file(sheet))
+    devices = devices or _devices_of_table(sheet, grid, into) or _only_device(into)
     before = read_file(into)
     try:
-        wanted = load(into, imports={device: sheet.absolute() for device in devices})
+        wanted = load(into, imports={device: (sheet.absolute(), grid) for device in devices})
     except ConfigErrors as error:
         ending = "one mistake" if error.count == 1 else f"{error.count} mistakes"
         last = f"{ending}: nothing was written"
@@ -96,17 +151,22 @@ def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True
     own = into.resolve()  # the file itself, not a link to it
 
     def check(new: Path) -> None:
-        if _meaning(load(new)) != _meaning(wanted):
+        try:
+            same = _meaning(load(new)) == _meaning(wanted)
+        except ConfigErrors:
+            same = False
+        if not same:
             raise ConfigError(
                 f"the tags cannot be inserted into {own.name} as it is written: "
                 "write `tags_from: <sheet>` into the device instead"
             )
 
-    replace(own, before, after, check, backup_of(own) if backup else None)
+    replace(own, before, after, check, backup_of(own) if backup else None, dry_run=dry_run)
     for use in uses:
         print_notes(sheet, use.notes)
     said = [_said(sheet, into, use) for use in uses]
-    return [*said, f"the file before is {backup_of(into).name}"] if backup else said
+    kept = backup and not dry_run
+    return [*said, f"the file before is {backup_of(into).name}"] if kept else said
 
 
 def _said(sheet: Path, into: Path, use: SheetUse) -> str:
@@ -118,9 +178,9 @@ def print_notes(sheet: Path, notes: tuple[str, ...] | list[str]) -> None:
         err.print(f"note: {sheet.name}: {note}")
 
 
-def _devices_of_table(sheet: Path, into: Path) -> list[str]:
+def _devices_of_table(sheet: Path, grid: Grid, into: Path) -> list[str]:
     """Returns the devices whose stations a communication table has; none for another sheet."""
-    stations = link_table.stations_in(read_grid(read_file(sheet)))
+    stations = link_table.stations_in(grid)
     devices = load(into).devices if stations else ()
     known = {device.driver.station: device.name for device in devices}
     if missing := [station for station in stations if station not in known]:
@@ -243,8 +303,23 @@ def read_file(path: Path) -> bytes:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from None
 
 
+def write_new(into: Path, text: str) -> None:
+    """Writes a file that does not exist. Raises `ConfigError`."""
+    try:
+        with into.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except OSError as error:
+        raise ConfigError(f"{into} cannot be written: {error.strerror}") from None
+
+
 def replace(
-    into: Path, before: bytes, after: bytes, check: Callable[[Path], None], backup: Path | None
+    into: Path,
+    before: bytes,
+    after: bytes,
+    check: Callable[[Path], None],
+    backup: Path | None,
+    *,
+    dry_run: bool = False,
 ) -> None:
     """Replaces the file at once, after `check` of the new text, which raises `ConfigError`."""
     new = into.with_name(f"{into.name}.new")
@@ -254,6 +329,8 @@ def replace(
         shutil.copymode(into, new)
         if into.read_bytes() != before:
             raise ConfigError(f"{into.name} was changed meanwhile: import again")
+        if dry_run:
+            return
         if backup is not None:
             shutil.copy2(into, backup)
         new.replace(into)

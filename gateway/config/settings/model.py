@@ -68,7 +68,7 @@ class DeviceSection(Section):
     tags: dict[str, Any] = {}
     """The values of the device, by name."""
     tags_from: FilePath | None = None
-    """A sheet with more tags of the device, CSV or .xlsx: docs/import.md."""
+    """A sheet with more tags of the device, or a project: docs/import.md."""
 
 
 class Rs485Section(Section):

@@ -7,6 +7,11 @@ Each function raises `ConfigError` with what would be right. A text that may sti
 import re
 import unicodedata
 from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
 
 from gateway.errors import ConfigError
 
@@ -18,64 +23,29 @@ _THOUSANDS = re.compile(
     r"([-+]?[1-9][0-9]{0,2}(?:(?P<mark>[., '’])[0-9]{3})(?:(?P=mark)[0-9]{3})*)([.,][0-9]+)?\Z"
 )
 _TIME = re.compile(r"([0-9]+(?:[.,][0-9]+)?) ?([^\d\s.,]+)\Z")
-_TIMES = {
-    **dict.fromkeys(("ms", "msec", "msek", "毫秒"), "ms"),
-    **dict.fromkeys(("s", "sec", "sek", "second", "seconds", "sekunde", "sekunden", "秒"), "s"),
-    **dict.fromkeys(("min", "minute", "minutes", "minuten", "分", "分鐘", "分钟"), "min"),
-    **dict.fromkeys(("h", "hour", "hours", "std", "stunde", "stunden", "小時", "小时"), "h"),
-}
-_YES = "true, yes, y, x, on, 1, ja, j, wahr, ein, ✓, ✔, 是, 真, 對, 对"
-_NO = "false, no, n, off, 0, nein, falsch, aus, -, 否, 假"
-_FLAGS = {
-    **dict.fromkeys(_YES.split(", "), True),
-    **dict.fromkeys(_NO.split(", "), False),
-}
-_WRITE = (
-    "rw, wr, w, write, read write, readwrite, read and write, writable, writeable, wo, "
-    "write only, ls, sl, schreiben, lesen schreiben, lesen und schreiben, schreibbar, "
-    "讀寫, 读写, 可讀寫, 可读写, 寫, 写, 可寫, 可写"
-)
-_READ = "r, ro, read, read only, readonly, l, lesen, nur lesen, 唯讀, 只读, 只讀, 讀, 读"
-_ACCESS = {
-    **_FLAGS,
-    **dict.fromkeys(_WRITE.split(", "), True),
-    **dict.fromkeys(_READ.split(", "), False),
-}
-_TYPES = {
-    "bool": "bool boolean bit digital binary binär bits 位 位元 開關 开关",
-    "int16": "int16 short int sint16 s16 i16 int16signed signed signed16 signedword word[signed] "
-    "wordsigned 16bitsigned int16s",
-    "uint16": "uint16 word ushort uint u16 unsigned unsigned16 unsignedword word[unsigned] "
-    "word[unsigned]/bitstring[16-bit] wordunsigned unsignedshort 16bitunsigned",
-    "int32": "int32 dint long s32 i32 sint32 signedlong doubleword[signed] doublewordsigned "
-    "32bitsigned",
-    "uint32": "uint32 dword udint ulong u32 unsignedlong doubleword doubleword[unsigned] "
-    "doubleword[unsigned]/bitstring[32-bit] 32bitunsigned",
-    "int64": "int64 lint llong s64 i64",
-    "uint64": "uint64 ulint qword lword u64",
-    "float32": "float32 float real single f32 float[singleprecision] singlefloat gleitkomma "
-    "浮點 浮点 浮點數 浮点数 實數 实数",
-    "float64": "float64 double lreal f64 float[doubleprecision]",
-    "bcd16": "bcd16 bcd",
-    "bcd32": "bcd32 lbcd",
-    "telephone": "telephone",
-    "": "default standard",
-}
-_KINDS = {spelling: kind for kind, row in _TYPES.items() for spelling in row.split()}
 _STRING = re.compile(r"(?:string|text|char|字串|字符串)\[?([0-9]*)\]?\Z")
 # `WORD[50]`, and `ARRAY[0..49] OF WORD` as IEC 61131 writes it
 _ARRAY = re.compile(
     r"(?:array\[(?P<first>[0-9]{1,5})\.\.(?P<last>[0-9]{1,5})\]of)?"
     r"(?P<kind>[^\[]+)(?(first)|\[(?P<count>[0-9]{1,5})\])\Z"
 )
-_ORDERS = {
-    **dict.fromkeys(("low first", "low", "little", "little endian"), "low_first"),
-    **dict.fromkeys(("high first", "high", "big", "big endian"), "high_first"),
-}
 _NAMED = re.compile(r"(-?[0-9]+)\s*[=:]\s*(['\"]?)(\S.*?)\2\Z")
 _SPREADSHEET_ERROR = re.compile(
-    r"#(REF|BEZUG|N/A|NV|NAME|VALUE|WERT|DIV/0|NUM|ZAHL|NULL)[!?]?\Z", re.IGNORECASE
+    r"(#(REF|BEZUG|N/A|NV|NAME|VALUE|WERT|DIV/0|NUM|ZAHL|NULL)[!?]?|Err:[0-9]+)\Z", re.IGNORECASE
 )
+
+
+@cache
+def data(name: str) -> dict[str, Any]:
+    """Returns the data of a file beside this one."""
+    return dict(yaml.safe_load(Path(__file__).with_name(name).read_bytes()))
+
+
+@cache
+def words(section: str) -> dict[str, Any]:
+    """Returns a section of words.yaml, the values by their words in the order of the file."""
+    rows = data("words.yaml")[section].items()
+    return {word: value for value, row in rows for word in row.split(", ")}
 
 
 def check(text: str) -> None:
@@ -119,18 +89,20 @@ def _tidy(text: str) -> str:
 
 def flag(text: str) -> bool:
     """Returns `yes`, `ja`, `WAHR`, `x`, `是` as True."""
-    known = _FLAGS.get(_plain(text))
-    if known is None:
-        raise ConfigError(f"{text!r} is neither yes nor no")
-    return known
+    return _word(text, "neither yes nor no", "flags")
 
 
 def access(text: str) -> bool:
     """Returns True for `R/W`, `write`, `yes`."""
-    known = _ACCESS.get(_plain(text), _ACCESS.get(_plain(text).replace(" ", "")))
-    if known is None:
-        raise ConfigError(f"{text!r} is no access: write R or R/W")
-    return known
+    return _word(text, "no access: write R or R/W", "flags", "access")
+
+
+def _word(text: str, what: str, *sections: str) -> bool:
+    for spelling in (_plain(text), _plain(text).replace(" ", "")):
+        for section in sections:
+            if spelling in words(section):
+                return bool(words(section)[spelling])
+    raise ConfigError(f"{text!r} is {what}")
 
 
 def kind(text: str, length: str) -> str | None:
@@ -142,16 +114,17 @@ def kind(text: str, length: str) -> str | None:
         if not count:
             raise ConfigError(f"{text} has no length: write {text}[16], or add a column Length")
         return f"string[{count}]"
-    if (match := _ARRAY.match(plain)) and match["kind"] in _KINDS:
+    kinds = words("types")
+    if (match := _ARRAY.match(plain)) and match["kind"] in kinds:
         first, last, count = match["first"], match["last"], match["count"]
-        return f"{_KINDS[match['kind']]}[{count or int(last) - int(first) + 1}]"
-    return _KINDS.get(plain, text) or None
+        return f"{kinds[match['kind']]}[{count or int(last) - int(first) + 1}]"
+    return kinds.get(plain, text) or None
 
 
 def duration(text: str, unit: str) -> str | int | float:
     """Returns `500 ms`, `0,5s`, `1 Sek` as durations. `unit`: of a number alone, if known."""
     if match := _TIME.match(text):
-        return match[1].replace(",", ".") + _TIMES.get(match[2].casefold(), match[2])
+        return match[1].replace(",", ".") + str(words("times").get(match[2].casefold(), match[2]))
     value = number(text, "." if "." in text else ",")
     return f"{value}{unit}" if unit else value
 
@@ -175,7 +148,7 @@ def names(text: str) -> dict[str, str]:
 
 
 def order(text: str) -> str:
-    return _ORDERS.get(_plain(text), text)
+    return str(words("orders").get(_plain(text), text))
 
 
 def address(text: str, bit: str) -> str:

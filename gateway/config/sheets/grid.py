@@ -4,12 +4,12 @@ import csv
 import io
 import itertools
 import re
-import zlib
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
-from zipfile import BadZipFile
+from typing import NamedTuple
 
 from gateway.config.sheets.columns import titles_in
+from gateway.config.sheets.projects import Project, read_project
+from gateway.config.sheets.workbooks import tables_of
 from gateway.errors import ConfigError
 
 DELIMITERS = ";,\t"
@@ -17,8 +17,7 @@ MOST_BYTES = 20_000_000  # a sheet of 10,000 tags has one
 HEADER_ROWS = 20  # the titles are in one of the first rows
 _MOST_CELL = 10_000  # characters
 _SEP = re.compile(r"sep=(.)\r?\n?\Z", re.IGNORECASE)
-_ZIP = b"PK\x03\x04"
-_OLD_EXCEL = b"\xd0\xcf\x11\xe0"
+_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _HIGH = re.compile(rb"[\x80-\xff]+")
 # Encodings of Chinese Excel; the narrowest first, so that a wrong one rarely fits.
@@ -26,12 +25,6 @@ _CHINESE = ("gb2312", "big5", "gb18030")
 # A spreadsheet takes a text that begins with one of these for a formula, and performs it.
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")
 _QUOTE = "'"  # before it: a text
-
-# What the reader of .xlsx files raises where bytes of the archive or of its XML are wrong.
-_DAMAGED = (
-    *(BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, SyntaxError),
-    *(ValueError, KeyError, IndexError, TypeError, AttributeError),
-)
 
 
 class Row(NamedTuple):
@@ -42,14 +35,18 @@ class Row(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """All rows. `decimal`: the decimal mark that the file must have, if its form tells."""
+    """All rows. `decimal`: the decimal mark that the file must have, if its form tells.
+
+    `project`: where the rows are the tags of one, numbered from 1.
+    """
 
     rows: list[Row]
     decimal: str | None
+    project: Project | None = None
 
 
 def read_grid(data: bytes) -> Grid:
-    """Returns the rows of a file; of an .xlsx file those of the sheet with the most titles.
+    """Returns the rows of a file; of a workbook those of the sheet with the most titles.
 
     Raises `ConfigError` where the file is no sheet.
     """
@@ -57,11 +54,13 @@ def read_grid(data: bytes) -> Grid:
         raise ConfigError(
             f"the file has more than {MOST_BYTES // 10**6} MB: it is no sheet of tags"
         )
-    if data.startswith(_OLD_EXCEL):
-        raise ConfigError("an old Excel file (.xls): save it as .xlsx or CSV")
-    if data.startswith(_ZIP):
-        return Grid(_xlsx(data), ".")
-    return _delimited(_decoded(data))
+    if data.startswith(_WORKBOOKS):
+        return Grid(_workbook(data), ".")
+    text = _decoded(data)
+    project = read_project(text)
+    if project is None:
+        return _delimited(text)
+    return Grid([Row(*row) for row in enumerate(project.rows)], ".", project)
 
 
 def neutral(text: str) -> str:
@@ -154,25 +153,12 @@ def _trimmed(cells: Iterable[str]) -> list[str]:
     return found
 
 
-def _xlsx(data: bytes) -> list[Row]:
-    try:
-        from openpyxl import load_workbook
-    except ImportError:
-        raise ConfigError(
-            "an .xlsx file needs one more package: pip install openpyxl, or save the sheet as CSV"
-        ) from None
-    try:
-        book = load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-        tabs = [list(_tab(book[name])) for name in book.sheetnames]
-    except _DAMAGED as error:
-        raise ConfigError(f"the file is no .xlsx file, or damaged: {error}") from None
-    return max(tabs, key=_titles, default=[])
-
-
-def _tab(sheet: Any) -> Iterator[Row]:
-    sheet.reset_dimensions()  # some programs write a wrong size
-    for number, cells in enumerate(sheet.iter_rows(values_only=True), 1):
-        yield Row(number, _trimmed(cell_text(cell) for cell in cells))
+def _workbook(data: bytes) -> list[Row]:
+    tables = [
+        [Row(number, _trimmed(map(cell_text, cells))) for number, cells in enumerate(table, 1)]
+        for table in tables_of(data)
+    ]
+    return max(tables, key=_titles, default=[])
 
 
 def _titles(rows: Iterable[Row]) -> int:

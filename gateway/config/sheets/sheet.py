@@ -1,12 +1,14 @@
 """Rows of a sheet as settings of tags, with the place of everything for messages."""
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
 from gateway.config.sheets import cells
-from gateway.config.sheets.columns import UNUSABLE, Column, Columns, columns_of, titles_in, unusable
+from gateway.config.sheets.columns import Column, Columns, columns_of, titles_in, unusable
 from gateway.config.sheets.grid import HEADER_ROWS, Grid, Row
 from gateway.errors import ConfigError
 
@@ -22,6 +24,7 @@ _READERS: dict[str, Callable[[str], object]] = {
 }
 _SCALINGS = ("", "none", "no", "keine", "linear")
 _KEPT = 3  # examples in a note
+_ASSIGNED = ("<auto>", "auto", "<자동>")  # an address that is only known in the PLC's program
 
 
 class SheetMistake(NamedTuple):
@@ -55,6 +58,7 @@ def read_sheet(
     header = _header(grid.rows)
     columns = columns_of(header.cells, others)
     reader = _Reader(columns, grid.decimal, header.number, others, parse)
+    reader.sheet.notes += grid.project.notes if grid.project else []
     reader.check_columns()
     rows = [row for row in grid.rows if row.number > header.number and _has_tag(row)]
     reader.learn(rows)
@@ -72,6 +76,38 @@ def devices_in(grid: Grid) -> list[str]:
         return []
     rows = (row for row in grid.rows if row.number > header.number and _has_tag(row))
     return list(dict.fromkeys(cells.name(cell) for row in rows if (cell := _at(row, column))))
+
+
+def adapted(grid: Grid, titles: Mapping[str, str], prefixes: Mapping[str, str]) -> Grid:
+    """Returns the sheet with settings as titles, and other beginnings of addresses.
+
+    `titles`: the title of each such setting. Raises `ConfigError` where no row has them all.
+    """
+    rows, settings = list(grid.rows), {title.casefold(): name for name, title in titles.items()}
+    if titles:
+        for at, row in enumerate(rows[:HEADER_ROWS]):
+            if settings.keys() <= {cell.casefold() for cell in row.cells}:
+                rows[at] = Row(row.number, [_title(cell, settings) for cell in row.cells])
+                break
+        else:
+            raise ConfigError(f"no row has the titles {', '.join(titles.values())}")
+    if prefixes:
+        header = _header(rows)
+        column = columns_of(header.cells, ()).by_setting.get("address")
+        for row in rows:
+            if column and row.number > header.number and column.index < len(row.cells):
+                text = row.cells[column.index]
+                old = max((one for one in prefixes if text.startswith(one)), key=len, default="")
+                row.cells[column.index] = prefixes.get(old, "") + text.removeprefix(old)
+    return grid._replace(rows=rows)
+
+
+def _title(cell: str, settings: Mapping[str, str]) -> str:
+    """Returns a title; another column with the meaning of a chosen one loses its own."""
+    if cell.casefold() in settings:
+        return settings[cell.casefold()]
+    meaning = columns_of([cell], ()).by_setting
+    return f"not used: {cell}" if meaning.keys() & set(settings.values()) else cell
 
 
 def _header(rows: Sequence[Row]) -> Row:
@@ -103,7 +139,7 @@ class _Reader:
     parse: Callable[[str], object]
     sheet: Sheet = field(default_factory=Sheet)
     renamed: list[str] = field(default_factory=list)
-    computed: int = 0  # rows of tags without an address
+    left: Counter[str] = field(default_factory=Counter)  # rows of tags that need no address
     devices: set[str] = field(default_factory=set)
 
     def check_columns(self) -> None:
@@ -120,19 +156,29 @@ class _Reader:
             if whole not in known and part in known:
                 self.sheet.columns[whole] = known[part].place
         if self.columns.unused:
-            self.sheet.notes.append(f"columns not used: {', '.join(self.columns.unused)}")
+            self.sheet.notes.append(f"columns not used: {', '.join(self.columns.unused.values())}")
 
     @property
     def _named(self) -> bool:
         """True where each row needs a name; labels may be empty."""
-        column = self.columns.by_setting.get("name")
-        return column is not None and "label" not in column.title.casefold()
+        return "name" in self.columns.by_setting and not self.columns.of_labels
+
+    def _check_names(self, rows: Sequence[Row]) -> None:
+        """Without a column of names, one that looks like names must not be left out."""
+        known = self.columns.by_setting
+        for index, title in () if "name" in known else self.columns.unused.items():
+            found = [row.cells[index] for row in rows if index < len(row.cells)]
+            texts = {text for text in found if re.search(r"[^\W\d]{2}", text)}
+            if len(texts) == len(rows) > 1:
+                what = f"names? Then add --columns name={title}; else delete the column"
+                self._mistake(self.header, what, Column("", title, index).place)
 
     def learn(self, rows: Sequence[Row]) -> None:
         """Finds what only all rows together tell: the decimal mark, and the devices."""
         found = (self._cell(row, setting) for row in rows for setting in _NUMBERS)
         self.decimal = self.decimal or cells.decimal_mark(found)
-        for setting in UNUSABLE:
+        self._check_names(rows)
+        for setting in cells.data("words.yaml")["unusable"]:
             if why := unusable(setting, {self._cell(row, setting) for row in rows}):
                 self._mistake(self.header, why, self._place(setting))
         self.devices = {whose for row in rows if (whose := self._cell(row, "device"))}
@@ -145,7 +191,11 @@ class _Reader:
         if whose and cells.name(whose) != device:
             return
         if self._cell(row, "computed"):
-            self.computed += 1
+            self.left["computed tags left out: write them into the file"] += 1
+            return
+        address = self._cell(row, "address").casefold()
+        if address in _ASSIGNED or (self.columns.of_labels and not address):
+            self.left["tags left out: the PLC's program chose their addresses itself"] += 1
             return
         row = self._without_errors(row)
         settings = dict(self._settings(row))
@@ -174,9 +224,7 @@ class _Reader:
         return Row(row.number, found)
 
     def finish(self, device: str) -> None:
-        if self.computed:
-            left = f"{self.computed} computed tags left out"
-            self.sheet.notes.append(f"{left}: write them into the file")
+        self.sheet.notes += [f"{count} {what}" for what, count in self.left.items()]
         if self.renamed:
             examples = ", ".join(self.renamed[:_KEPT])
             more = f" and {len(self.renamed) - _KEPT} more" if len(self.renamed) > _KEPT else ""

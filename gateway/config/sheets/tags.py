@@ -34,6 +34,7 @@ class SheetPlaces:
 
     name: str
     sheet: Sheet
+    is_project: bool = False
 
     def line(self, path: Path) -> int:
         """Returns the row of the tag at `path`: its name, then a setting."""
@@ -42,7 +43,14 @@ class SheetPlaces:
     def at(self, line: int, path: Path) -> str:
         places = (self.sheet.columns.get(str(chunk)) for chunk in reversed(path[1:]))
         column = next(filter(None, places), dotted(path[1:]))
-        return f"{self.name}: row {line}{', ' if column else ''}{column}: "
+        return self.place(line, column)
+
+    def place(self, line: int, column: str) -> str:
+        """Returns the place of a mistake; the tags of a project have numbers, and no columns."""
+        if self.is_project:
+            column = column.partition("(")[2].rstrip(")")
+        unit = "tag" if self.is_project else "row"
+        return f"{self.name}: {unit} {line}{', ' if column else ''}{column}: "
 
 
 @dataclass(slots=True)
@@ -53,7 +61,7 @@ class SheetTags:
     folder: FilePath
     used: list[SheetUse] = field(default_factory=list)
     recorded: Path | None = None  # as in `DeviceTags`
-    _grids: dict[FilePath, Grid | None] = field(default_factory=dict)
+    grids: dict[FilePath, Grid | None] = field(default_factory=dict)  # those that were read
 
     def build(
         self,
@@ -77,7 +85,7 @@ class SheetTags:
         except ConfigError as error:
             self.mistakes.add(path, f"{file}: {error}")
             return ()
-        mistakes = _mistakes(file, sheet)
+        mistakes = _mistakes(file, sheet, grid)
         for name in sheet.tags.keys() & taken:
             mistakes.add((name, "name"), f"{name} is in `tags` of {device} already")
         builder = DeviceTags(mistakes)
@@ -89,15 +97,15 @@ class SheetTags:
         return tags
 
     def _grid(self, file: FilePath, path: Path) -> Grid | None:
-        if file not in self._grids:
-            self._grids[file] = None
+        if file not in self.grids:
+            self.grids[file] = None
             try:
-                self._grids[file] = read_grid(files.read(file))
+                self.grids[file] = read_grid(files.read(file))
             except ConfigError as error:
                 self.mistakes.add(path, f"{file.name}: {error}")
             except OSError as error:
                 self.mistakes.add(path, f"{file} cannot be read: {error.strerror}")
-        return self._grids[file]
+        return self.grids[file]
 
 
 def native(driver: object) -> Callable[[str], str]:
@@ -125,17 +133,18 @@ def preview(
             "station is which"
         )
     sheet = read_sheet(grid, device, other_settings(), parsed)
-    mistakes = _mistakes(file, sheet)
+    mistakes = _mistakes(file, sheet, grid)
     DeviceTags(mistakes).build(device, sheet.tags, (), TagDefaults(), None)
     mistakes.raise_all()
     return sheet.tags, sheet.notes
 
 
-def _mistakes(file: FilePath, sheet: Sheet) -> Mistakes:
+def _mistakes(file: FilePath, sheet: Sheet, grid: Grid) -> Mistakes:
     name = file.name if file.is_absolute() else str(file)
-    mistakes = Mistakes(SheetPlaces(name, sheet))
+    places = SheetPlaces(name, sheet, grid.project is not None)
+    mistakes = Mistakes(places)
     for row, column, what in sheet.mistakes:
-        mistakes.add_at(row, f"{name}: row {row}{', ' if column else ''}{column}: ", what)
+        mistakes.add_at(row, places.place(row, column), what)
     return mistakes
 
 
