@@ -41,6 +41,7 @@ from gateway.line.send_permit import SendPermit
 from gateway.northbound.group.standby import GroupSettings, Standby
 from gateway.northbound.session.exposures import exposures
 from gateway.parts.history.historian import Historian
+from gateway.parts.notify.outbox import Outbox
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from gateway.tags.tag import READ
@@ -151,6 +152,7 @@ def test_every_page_with_files_is_checked() -> None:
             "systems.md",
             "device-servers.md",
             "share.md",
+            "notify.md",
         ),
         *("modem.md", "transfers.md"),
         *("templates.md", "trace.md", "alarms.md", "arrays.md"),
@@ -699,6 +701,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
     known |= Standby(GroupSettings("hall"), None, Keys("plant", "demo"), SendPermit()).documents()
     known["certificates/"] = certificates.document(tmp_path, 0.0, 0.0)
+    known["notify/"] = Outbox(1.0).document()
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)
@@ -718,7 +721,8 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
 
 def page_of(document: str) -> str:
     """The page with the fields of a status document."""
-    return "share.md" if document.startswith("`doors") else "status.md"
+    pages = {"`doors": "share.md", "`notify": "notify.md"}
+    return pages.get(document.partition("/")[0], "status.md")
 
 
 def heading(document: str) -> str:

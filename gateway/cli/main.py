@@ -37,6 +37,7 @@ _COMMANDS = {
     "health": "status:health",
     "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",
+    "notify": "notify:notify",
     "audit": "audit:audit",
     "trace": "trace:trace",
     "replay": "line.replay:replay",

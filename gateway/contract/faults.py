@@ -52,6 +52,10 @@ def _of_parts(documents: Documents) -> Iterator[str]:
     for door, document in below("doors/", documents):
         if document["trouble"]:
             yield f"door {door} to line {document['line']} is closed: {document['trouble']}"
+    for way, document in below("notify/", documents):
+        if document["trouble"]:
+            wait = f"{document['waiting']} messages about alarms wait"
+            yield f"{way} does not work: {document['trouble']}; {wait} since {document['oldest']}"
     for part, document in below("files/", documents):
         if document["trouble"]:
             yield f"{part} not saved: {document['trouble']}; a restart forgets the last changes"

@@ -155,6 +155,13 @@ class Shown(Protocol):
 class Listed(Protocol):
     """Has a list of alarms."""
 
+    @property
+    def changes(self) -> int:
+        """Grows with each change."""
+
+    def one(self, key: str) -> Mapping[str, Any] | None:
+        """Returns the document of an alarm; None: there is no such alarm."""
+
     def page(self, state: str, after: str | None, most: int) -> Mapping[str, Any]:
         """Returns a page, after the alarm `after`. Any thread may call it. Raises `BadValue`."""
 

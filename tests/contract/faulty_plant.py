@@ -134,6 +134,7 @@ def faulty_plant(folder: Path) -> Iterator[Plant]:
         history={"path": "history.db"},
         alarms={"path": "alarms.json", "devices": True, "lines": True},
         gateway={"name": "demo", "standby": "hall", "audit": "audit.jsonl"},
+        notify={"command": ["/bin/false"], "rules": [{"to": ["command"]}]},
         share={"doors": {"laptop": door}},
         transfers=[{"from": "mixer/speed", "to": "mixer/trim", "every": "1s", "stale": "9s"}],
     )

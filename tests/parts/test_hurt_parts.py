@@ -64,6 +64,7 @@ class Plant:
             web={"listen": f"127.0.0.1:{self.port}", "tokens_file": "tokens"},
             history={"path": "history.db"},
             alarms={"path": "alarms.json"},
+            notify={"command": ["/bin/true"], "rules": [{"to": ["command"]}]},
             templates_from="templates.yaml",
             defaults={"every": "100ms", "history": True},
             share={"doors": {"laptop": door}},
@@ -148,6 +149,7 @@ POINTS = {
     "doors": ("run", "documents", "take_over"),
     "transfers": ("run", "publish", "documents", "take_over"),
     "alarms": ("run", "seen", "documents", "retag", "take_over"),
+    "notify": ("run", "documents"),
     "damaged_files": ("run", "documents"),
     "web": ("run",),
 }

@@ -104,8 +104,8 @@ def _known(kind: type[BaseModel], place: Path) -> Collection[str]:
         inner = _inner(annotation)
         if inner is None:
             return ()
-        if get_origin(annotation) is dict:
-            next(chunks, None)  # the name of one of several sections
+        if get_origin(annotation) in (dict, list):
+            next(chunks, None)  # the name or number of one of several sections
         kind = inner
     return settings_of(kind)
 

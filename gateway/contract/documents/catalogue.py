@@ -54,6 +54,7 @@ _STATE: dict[str, Any] = {  # by path
     "damaged": state.DamagedDocument,
     "transfers/{number}": state.TransferDocument,
     "doors/{door}": state.DoorDocument,
+    "notify/{way}": state.NotifyDocument,
     "clock": state.ClockDocument,
     "parts/{part}": state.PartDocument,
     "certificates/{setting}": state.CertificateDocument,

@@ -310,6 +310,22 @@ class DoorDocument(TypedDict):
     programs: list[GuestDocument]
 
 
+class NotifyDocument(TypedDict):
+    """One way on which alarms reach people.
+
+    `oldest`: the time of the message that waits longest. `failed`: tries in a row. `dropped`:
+    messages that were too old, or too many.
+    """
+
+    waiting: int
+    oldest: str | None
+    sent: int
+    last_sent: str | None
+    failed: int
+    dropped: int
+    trouble: str
+
+
 class ServedKey(TypedDict):
     key: str
     verbs: list[str]

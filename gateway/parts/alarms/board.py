@@ -38,6 +38,7 @@ class Alarms:
         self.entries: dict[str, Entry] = {}
         self.tally = Tally()
         self.changed = asyncio.Event()  # something is to be saved
+        self.changes = 0  # what happened, so far
         self._by_tag: dict[Tag, Entry] = {}
         self._watched: list[Entry] = []
         self._parts: dict[str, list[Entry]] = {}  # by the key of their parent
@@ -166,6 +167,7 @@ class Alarms:
 
     def _report(self, entry: Entry, event: Event | None) -> None:
         if event is not None:
+            self.changes += 1
             self.tally.count(entry)
             self.changed.set()
             log_change(entry, event)

@@ -201,6 +201,14 @@ class AlarmPart:
             "next": found[most - 1].key if len(found) > most else None,
         }
 
+    @property
+    def changes(self) -> int:
+        return self.alarms.changes
+
+    def one(self, key: str) -> Mapping[str, Any] | None:
+        entry = self.alarms.entries.get(key)
+        return None if entry is None else self._fields(entry)
+
     def _select(self, state: str) -> list[Entry]:
         if state == "open":
             return open_alarms(self.alarms)

@@ -1,0 +1,51 @@
+"""The `notify` command: a test of the ways on which alarms reach people."""
+
+import asyncio
+import time
+from typing import Annotated
+
+import typer
+
+from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
+from gateway.config import load
+from gateway.errors import ConfigError, GatewayError
+
+
+def notify(
+    config: ConfigPath,
+    ways: Annotated[
+        list[str] | None, typer.Argument(metavar="[WAY]...", help="mail, webhook, boss@plant ...")
+    ] = None,
+) -> None:
+    """Send a test message on each way of `notify:`, or on some, from this machine."""
+    from gateway.parts.notify.message import message
+    from gateway.parts.notify.settings import NotifySection
+    from gateway.parts.notify.watch import TEST
+    from gateway.parts.notify.ways import WITHIN
+    from gateway.parts.notify.ways import ways as ways_of
+
+    loaded = load(config)
+    if (settings := loaded.part(NotifySection)) is None:
+        raise ConfigError(f"{config} has no section notify")
+    known = ways_of(settings)
+    if unknown := [way for way in ways or () if way not in known]:
+        raise ConfigError(f"no rule of notify uses {unknown[0]}: there are {', '.join(known)}")
+    test = message(loaded.zenoh.prefix, loaded.name, [TEST], time.time_ns())
+
+    async def send() -> list[str]:
+        failed = list[str]()
+        for way in ways or known:
+            try:
+                async with asyncio.timeout(WITHIN):
+                    await known[way](test)
+                out.print(f"{way}: sent")
+            except TimeoutError:
+                failed.append(f"{way}: no answer within {WITHIN:g} s")
+            except GatewayError as error:
+                failed.append(f"{way}: {error}")
+        return failed
+
+    if failed := asyncio.run(send()):
+        for one in failed[:-1]:
+            err.print(printable(one))
+        end(printable(failed[-1]), FAILED)

@@ -1,0 +1,1 @@
+"""Alarms that reach people: by mail, webhook, MQTT or a command."""

@@ -1,0 +1,174 @@
+"""Notification as a part: looks at the alarms, writes messages, and sends them on each way.
+
+A message is sent at least once: after a crash, or an answer that came too late, twice with the same
+`id`. What waits and what was sent is kept in a file.
+"""
+
+import asyncio
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import orjson
+import structlog
+
+from gateway.errors import GatewayError
+from gateway.parts.notify.message import Message, message
+from gateway.parts.notify.outbox import Outbox
+from gateway.parts.notify.settings import NotifySection, rules_of
+from gateway.parts.notify.watch import Alarm, Told, Watch
+from gateway.parts.notify.ways import WITHIN, ways
+from gateway.plant.part import Core, Kind, Listed, Part
+from gateway.plant.saved_file import SavedFile
+from gateway.plant.threads import off_loop
+
+log = structlog.get_logger("gateway")
+FORMAT = 1
+LOOK_EVERY = 1.0  # seconds
+READ_EVERY = 10.0  # seconds: values change without an event
+MOST_ALARMS = 2000  # of the list: those without acknowledgement first, then by priority
+AGAIN_FIRST, AGAIN_LONGEST = 2.0, 60.0  # seconds between two tries
+CLOSE_WITHIN = 0.5  # seconds
+# By rule and alarm: when it was raised, when it was sent (ns since 1970), whether its end was.
+_ToldByRule = dict[str, dict[str, tuple[str, int, bool]]]
+
+
+class NotifyPart:
+    """All rules and ways of the file. Belongs to the event loop."""
+
+    def __init__(self, core: Core, settings: NotifySection) -> None:
+        self._core = core
+        self._ways = ways(settings)
+        self._boxes = {way: Outbox(settings.keep) for way in self._ways}
+        self._filled = {way: asyncio.Event() for way in self._ways}
+        self._watches = [Watch(rule) for rule in rules_of(settings)]
+        self._file = SavedFile(settings.path)
+        self._unsaved = False
+        self._alarms: Mapping[str, Alarm] = {}  # those that are not normal
+        self._read: tuple[object, ...] = ()  # list and change of the last read
+        self._read_at = -READ_EVERY
+
+    # -- life --
+
+    async def begin(self) -> None:
+        if (known := await off_loop(self._file.load, _parse)) is None:
+            return
+        told, waiting = known
+        now, wall = asyncio.get_running_loop().time(), self._core.plant.wall()
+        for watch in self._watches:
+            for key, (raised, at, ended) in told.get(watch.rule.key, {}).items():
+                watch.told[key] = Told(raised, now - max(0, wall - at) / 1e9, ended)
+        for way, box in self._boxes.items():
+            box.restore(waiting.get(way, ()))
+
+    async def run(self) -> None:
+        self._file.start()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._look())
+                for way in self._ways:
+                    tasks.create_task(self._send_all(way))
+        finally:
+            self._file.save_last(self._snapshot())
+            if not await off_loop(self._file.close, CLOSE_WITHIN):
+                log.warning("notify file close timed out", effect="a message may be sent twice")
+
+    def documents(self) -> Mapping[str, Mapping[str, object]]:
+        found: dict[str, Mapping[str, object]] = {
+            f"notify/{way}": box.document() for way, box in self._boxes.items()
+        }
+        return {**found, "files/notify": {"trouble": self._file.trouble or ""}}
+
+    # -- messages --
+
+    async def _look(self) -> None:
+        while True:
+            for listed in self._core.others.each(Listed):
+                await self._read_alarms(listed)
+                self._apply(listed)
+            if self._unsaved and self._file.save_soon(self._snapshot()):
+                self._unsaved = False
+            await asyncio.sleep(LOOK_EVERY)
+
+    async def _read_alarms(self, listed: Listed) -> None:
+        now, version = asyncio.get_running_loop().time(), (listed, listed.changes)
+        if version == self._read and now - self._read_at < READ_EVERY:
+            return
+        page = await off_loop(listed.page, "open", None, MOST_ALARMS)
+        self._alarms = {str(one["alarm"]): one for one in page["alarms"]}
+        self._read, self._read_at = version, now
+
+    def _apply(self, listed: Listed) -> None:
+        now, wall = asyncio.get_running_loop().time(), self._core.plant.wall()
+        clock = datetime.fromtimestamp(wall / 1e9, UTC).astimezone()
+        config = self._core.config
+        for watch in self._watches:
+            if notices := watch.look(self._alarms, listed.one, now, clock):
+                new = message(config.zenoh.prefix, config.name, notices, wall)
+                for way in watch.rule.to:
+                    self._boxes[way].put(new)
+                    self._filled[way].set()
+                self._unsaved = True
+
+    async def _send_all(self, way: str) -> None:
+        box, again = self._boxes[way], AGAIN_FIRST
+        while True:
+            waiting = box.first(self._core.plant.wall())
+            if waiting is None:
+                self._filled[way].clear()
+                await self._filled[way].wait()
+                continue
+            try:
+                async with asyncio.timeout(WITHIN):
+                    await self._ways[way](waiting)
+                why = ""
+            except TimeoutError:
+                why = f"no answer within {WITHIN:g} s"
+            except GatewayError as error:
+                why = str(error)
+            self._unsaved = True
+            if not why:
+                box.sent(waiting, self._core.plant.wall())
+                log.info("alarm message sent", way=way, id=waiting.id, subject=waiting.subject)
+                again = AGAIN_FIRST
+                continue
+            if box.not_sent(why):
+                log.warning("alarm message not sent", way=way, id=waiting.id, why=why)
+            await asyncio.sleep(again)
+            again = min(2 * again, AGAIN_LONGEST)
+
+    # -- the file --
+
+    def _snapshot(self) -> bytes:
+        now, wall = asyncio.get_running_loop().time(), self._core.plant.wall()
+        told = {
+            watch.rule.key: {
+                key: (one.raised, wall - round((now - one.at) * 1e9), one.ended)
+                for key, one in watch.told.items()
+            }
+            for watch in self._watches
+        }
+        waiting = {way: box.saved() for way, box in self._boxes.items()}
+        return orjson.dumps({"form": FORMAT, "told": told, "waiting": waiting})
+
+
+def _parse(document: Any) -> tuple[_ToldByRule, dict[str, list[Message]]]:
+    """Raises ValueError, TypeError, KeyError, AttributeError for a damaged file."""
+    if document["form"] != FORMAT:
+        raise ValueError(f"form {document['form']} is not {FORMAT}")
+    told = {
+        rule: {
+            key: (str(raised), int(at), ended is True) for key, (raised, at, ended) in known.items()
+        }
+        for rule, known in document["told"].items()
+    }
+    waiting = document["waiting"].items()
+    return told, {way: [Message.restored(one) for one in found] for way, found in waiting}
+
+
+def _make(core: Core) -> Part | None:
+    settings = core.config.part(NotifySection)
+    return None if settings is None else NotifyPart(core, settings)
+
+
+KIND = Kind(_make)

@@ -1,0 +1,262 @@
+"""The ways to people: mail, webhook, MQTT, a command.
+
+Each sends one message, or raises a `GatewayError` that says why not. The caller ends a try that
+takes longer than `WITHIN`.
+"""
+
+import base64
+import binascii
+import hashlib
+import hmac
+import os
+import signal
+import smtplib
+import ssl
+import subprocess
+import threading
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from email.message import EmailMessage
+from email.utils import format_datetime
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from gateway.contract.access.secrets import readable_secret
+from gateway.errors import ConfigError, GatewayError
+from gateway.parts.notify.message import Message
+from gateway.parts.notify.settings import (
+    MailSection,
+    MqttSection,
+    NotifySection,
+    Server,
+    WebhookSection,
+)
+from gateway.plant.threads import off_loop
+
+WITHIN = 30.0  # seconds for one try
+COMMAND_WITHIN = 25.0  # seconds
+_STEP_WITHIN = 10.0  # seconds for each answer of a mail server
+
+Send = Callable[[Message], Coroutine[Any, Any, None]]
+
+
+def ways(settings: NotifySection) -> dict[str, Send]:
+    """Returns the ways that the rules use, by name. Each raises `GatewayError`."""
+    used = dict.fromkeys(way for rule in settings.rules for way in rule.to)
+    return {way: _way(way, settings) for way in used}
+
+
+def _way(way: str, settings: NotifySection) -> Send:
+    if way == "webhook" and settings.webhook is not None:
+        return _Webhook(settings.webhook).send
+    if way == "mqtt" and settings.mqtt is not None:
+        return _Mqtt(settings.mqtt).send
+    if way == "command" and settings.command is not None:
+        return _Blocking(_Command(settings.command).send).send
+    if settings.mail is None:
+        raise ConfigError(f"notify: there is no {way}")
+    to = settings.mail.to if way == "mail" else [way]
+    return _Blocking(_Mail(settings.mail, to).send).send
+
+
+class _Blocking:
+    """A way that blocks its thread. A try that does not end keeps the next from beginning: a server
+    that never answers holds one thread."""
+
+    def __init__(self, send: Callable[[Message], None]) -> None:
+        self._send = send
+        self._busy = threading.Lock()
+
+    async def send(self, message: Message) -> None:
+        await off_loop(self._alone, message)
+
+    def _alone(self, message: Message) -> None:
+        if not self._busy.acquire(blocking=False):
+            raise GatewayError("the last try has no answer yet")
+        try:
+            self._send(message)
+        finally:
+            self._busy.release()
+
+
+class _Mail:
+    def __init__(self, settings: MailSection, to: Sequence[str]) -> None:
+        self._settings = settings
+        self._to = to
+
+    def send(self, message: Message) -> None:
+        settings = self._settings
+        try:
+            with self._connected(settings.server) as server:
+                if settings.user and settings.password_file:
+                    server.login(settings.user, _first_line(settings.password_file, "mail"))
+                server.send_message(_mail(message, settings.from_, self._to))
+        except smtplib.SMTPRecipientsRefused as error:
+            raise GatewayError(f"the server refuses {', '.join(error.recipients)}") from None
+        except (OSError, smtplib.SMTPException, ValueError) as error:
+            raise GatewayError(_said(error)) from None
+
+    def _connected(self, at: Server) -> smtplib.SMTP:
+        if at.scheme == "smtps":
+            context = _trusted(self._settings.ca)
+            return smtplib.SMTP_SSL(at.host, at.port, timeout=_STEP_WITHIN, context=context)
+        server = smtplib.SMTP(at.host, at.port, timeout=_STEP_WITHIN)
+        try:
+            server.ehlo()
+            if server.has_extn("starttls") or not at.is_local:
+                server.starttls(context=_trusted(self._settings.ca))
+        except (OSError, smtplib.SMTPException, ValueError):
+            server.close()
+            raise
+        return server
+
+
+def _mail(message: Message, sender: str, to: Sequence[str]) -> EmailMessage:
+    mail = EmailMessage()
+    mail["From"], mail["To"] = sender, ", ".join(to)
+    mail["Subject"] = "".join(c if c.isprintable() else " " for c in message.subject)
+    mail["Date"] = format_datetime(datetime.fromtimestamp(message.time / 1e9, UTC))
+    mail["Message-ID"] = f"<{message.id}@{sender.partition('@')[2]}>"
+    mail["Auto-Submitted"] = "auto-generated"  # no reply of a machine, please
+    mail.set_content(message.text)
+    return mail
+
+
+class _Webhook:
+    """Signs as Standard Webhooks 1.0 says: HMAC-SHA256 over id, time and body."""
+
+    def __init__(self, settings: WebhookSection) -> None:
+        self._settings = settings
+
+    async def send(self, message: Message) -> None:
+        import aiohttp  # takes 0.1 s, and few plants have a webhook
+
+        body, headers, context = await off_loop(self._prepare, message)
+        try:
+            async with (
+                aiohttp.ClientSession(trust_env=False) as session,
+                session.post(
+                    self._settings.url.url,
+                    data=body,
+                    headers=headers,
+                    ssl=context,
+                    allow_redirects=False,
+                ) as answer,
+            ):
+                if not 200 <= answer.status < 300:
+                    raise GatewayError(f"the server answers {answer.status} {answer.reason}")
+        except (aiohttp.ClientError, OSError, ValueError) as error:
+            raise GatewayError(_said(error)) from None
+
+    def _prepare(self, message: Message) -> tuple[bytes, dict[str, str], ssl.SSLContext | bool]:
+        """Blocks: it reads files."""
+        settings = self._settings
+        body = orjson.dumps(message.document)
+        sent = str(int(datetime.now(UTC).timestamp()))
+        headers = {
+            "content-type": "application/json",
+            "webhook-id": message.id,
+            "webhook-timestamp": sent,
+        }
+        if settings.secret_file is not None:
+            secret = _first_line(settings.secret_file, "webhook")
+            headers["webhook-signature"] = signature(secret, f"{message.id}.{sent}.", body)
+        return body, headers, _trusted(settings.ca) if settings.url.scheme == "https" else True
+
+
+def signature(secret: str, begin: str, body: bytes) -> str:
+    """Returns the header. `secret`: any text, or `whsec_` and base64. Raises `GatewayError`."""
+    key = secret.encode()
+    if secret.startswith("whsec_"):
+        try:
+            key = base64.b64decode(secret.removeprefix("whsec_"), validate=True)
+        except binascii.Error:
+            raise GatewayError("notify.webhook.secret_file: no base64 after whsec_") from None
+    signed = hmac.digest(key, begin.encode() + body, hashlib.sha256)
+    return f"v1,{base64.b64encode(signed).decode()}"
+
+
+class _Mqtt:
+    def __init__(self, settings: MqttSection) -> None:
+        try:
+            import aiomqtt
+        except ImportError:
+            text = "notify.mqtt needs one more package: pip install aiomqtt"
+            raise ConfigError(text) from None
+        self._settings = settings
+        self._library = aiomqtt
+
+    async def send(self, message: Message) -> None:
+        settings, at = self._settings, self._settings.broker
+        password, context = await off_loop(self._prepare)
+        try:
+            async with self._library.Client(
+                at.host,
+                at.port,
+                username=settings.user,
+                password=password,
+                tls_context=context,
+                timeout=WITHIN,
+            ) as client:
+                await client.publish(settings.topic, orjson.dumps(message.document), qos=1)
+        except (self._library.MqttError, OSError, ValueError) as error:
+            raise GatewayError(_said(error)) from None
+
+    def _prepare(self) -> tuple[str | None, ssl.SSLContext | None]:
+        """Blocks: it reads files."""
+        settings = self._settings
+        file = settings.password_file
+        password = None if file is None else _first_line(file, "mqtt")
+        is_tls = settings.broker.scheme == "mqtts"
+        return password, _trusted(settings.ca) if is_tls else None
+
+
+class _Command:
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+
+    def send(self, message: Message) -> None:
+        try:
+            process = subprocess.Popen(  # noqa: S603  (the file names it)
+                self._command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as error:
+            raise GatewayError(f"{self._command[0]}: {_said(error)}") from None
+        with process:
+            try:
+                process.communicate(orjson.dumps(message.document), timeout=COMMAND_WITHIN)
+            except subprocess.TimeoutExpired:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                raise GatewayError(f"{self._command[0]} has not ended: killed") from None
+        if process.returncode != 0:
+            raise GatewayError(f"{self._command[0]} ended with {process.returncode}")
+
+
+def _first_line(path: Path, way: str) -> str:
+    """Returns a secret. Blocks."""
+    try:
+        return readable_secret(path, f"notify.{way}").partition("\n")[0].strip()
+    except ConfigError as error:
+        raise GatewayError(str(error)) from None
+
+
+def _trusted(ca: Path | None) -> ssl.SSLContext:
+    """Raises `GatewayError`. Blocks."""
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except (OSError, ValueError) as error:
+        raise GatewayError(f"{ca}: {_said(error)}") from None
+
+
+def _said(error: Exception) -> str:
+    """Returns one sentence. A server may answer anything."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return "".join(c if c.isprintable() else "?" for c in text)[:200]
