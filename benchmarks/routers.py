@@ -1,9 +1,10 @@
 """A publisher with several routers, one of which is killed: `python -m benchmarks.routers`.
 
 Three routers are linked to each other; a client is connected to the last one. A session without a
-gateway, as a client or a peer of two or three of the routers, publishes five values a second and
-has a token. The program kills the first router, starts it again, and counts in how many rounds the
-client missed values for three seconds, received values twice, or did not see the token afterwards.
+gateway, as a client, peer or router that knows two or three of them, publishes five values a second
+and has a token. The program kills the first router, starts it again, and counts in how many rounds
+the client missed values for three seconds, received values twice, or did not see the token
+afterwards.
 """
 
 import argparse
@@ -63,16 +64,14 @@ async def play(mode: str, known: int, dead: float, back: float) -> Round:
 async def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--modes", nargs="+", default=["client", "peer"])
+    parser.add_argument("--modes", nargs="+", default=["client", "peer", "router"])
     parser.add_argument("--dead", type=float, default=3.0, help="seconds without the router")
     parser.add_argument("--back", type=float, default=4.0, help="seconds with it again")
     options = parser.parse_args()
     rounds = options.rounds
     print("| mode | routers | rounds | values stopped | values twice | token lost |")
     print("|---|---|---|---|---|---|")
-    for mode, known in (("client", 2), ("peer", 2), ("peer", 3)):
-        if mode not in options.modes:
-            continue
+    for mode, known in ((mode, known) for mode in options.modes for known in (2, 3)):
         found = [await play(mode, known, options.dead, options.back) for _ in range(rounds)]
         counts = " | ".join(str(sum(column)) for column in zip(*found, strict=True))
         print(f"| {mode} | {known} | {rounds} | {counts} |", flush=True)

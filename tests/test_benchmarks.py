@@ -18,6 +18,7 @@ TINY = [
         [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],
     ),
     ("commands", "--calls 1", [r"^\| `check` \| \d+ \|$", r"^\| `run` \| \d+ \|$"]),
+    ("encodings", "", [r"^\| a value \| 68 \| 57 \(84%\) \|"]),
     ("frames_noise", "0.07", [r"^gap +CR +[\d.]+ +[\d.]+ +[\d.]+$"]),
     (
         "history",
