@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 from pydantic import BaseModel, TypeAdapter
 
 from gateway.config.settings.model import DeviceSection, LineSection
-from gateway.config.settings.parsers import BYTES, SECONDS
+from gateway.config.settings.parsers import BYTES
 from gateway.config.settings.sections import file_section
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import (
@@ -25,6 +25,7 @@ from gateway.errors import ConfigError
 from gateway.protocols.registry import PROTOCOLS
 
 _TIMES = (DURATION_SCHEMA["pattern"], INTERVAL_SCHEMA["pattern"])
+_SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
 _PARTS["Transfer"] = TransferSection
 _DEVICE_NAMES = rf"{NAME_PATTERN}|\{{"  # a repeated device has its number in the name: pump-{{n}}
@@ -179,7 +180,7 @@ def _write_default(setting: dict[str, Any]) -> None:
     """Writes a default as the file does: `7d`, not 604800 seconds. Removes null defaults."""
     match setting.get("default", ...), setting.get("pattern"):
         case float(seconds), pattern if pattern in _TIMES:
-            setting["default"] = _in_unit(seconds, SECONDS)
+            setting["default"] = _in_unit(seconds, _SECONDS)
         case int(octets), str():
             setting["default"] = _in_unit(octets, BYTES)
         case dict(), _:

@@ -137,6 +137,10 @@ def one_of(names: Iterable[str]) -> str:
 
 def meant(name: str, known: Iterable[str]) -> str:
     """Suggests the most similar name, or all names."""
+    if name.isdecimal():  # {scale: 0,1} is a scale of 0, and a setting 1
+        return "a number has a point, not a comma, such as 0.1"
+    if ":" in name:
+        return f"write a space after the colon: {name.replace(':', ': ', 1)}"
     choices, lower = list(known), name.lower()
     for spelt in (lower, lower.replace("-", "_")):
         if close := similar(spelt, choices):
@@ -166,7 +170,8 @@ def shown(value: object) -> str:
         case int() | float():
             return f"{value:.15g}" if isinstance(value, float) else _digits(value)
         case _:
-            return repr(value)
+            text = repr(value)
+            return f"{text} (\\xa0 is a no-break space)" if r"\xa0" in text else text
 
 
 def _digits(value: int) -> str:

@@ -21,7 +21,6 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late
 """
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -29,10 +28,9 @@ from typing import Final, NamedTuple
 
 from gateway.config.settings import parsers
 from gateway.errors import BadValue, ConfigError
+from gateway.values.numerals import nanoseconds
 
 CONTRACT: Final = 1  # the number of the contract: docs/contract.md
-_DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?)(ms|s|min|m|h|d|)\Z")
-_SECONDS = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 class Family(StrEnum):
@@ -215,11 +213,11 @@ class Keys:
 
 
 def max_age(text: str) -> float:
-    """The seconds of `?max_age=500ms` (ms, s, min, h, d; s when no unit). Raises `BadValue`."""
-    match = _DURATION.match(text)
-    if match is None:
+    """The seconds of `?max_age=500ms`, or of a number of seconds. Raises `BadValue`."""
+    time = nanoseconds(f"{text}s" if text[-1:].isdigit() else text)
+    if time is None:
         raise BadValue(f"max_age={text[:40]} is no duration such as 0s, 500ms or 2min")
-    return float(match[1]) * _SECONDS[match[2]]
+    return time / 10**9
 
 
 def _check(parse: Callable[[object], str], text: str, what: str) -> None:

@@ -11,6 +11,10 @@ from gateway.errors import BadValue
 Scalar = bool | int | float | str
 _SINGLE = struct.Struct(">f")
 _TOO_LARGE_SINGLE = 2.0**128 - 2.0**103  # from here on a float of 32 bits is infinite
+# In nanoseconds, from the longest on; `m` and `u` as Zenoh writes them.
+TIMES = {"w": 604_800 * 10**9, "d": 86_400 * 10**9, "h": 3_600 * 10**9, "min": 60 * 10**9}
+TIMES |= {"m": TIMES["min"], "s": 10**9, "ms": 10**6, "us": 10**3, "u": 10**3}
+_TIME = re.compile(r"([0-9]{0,18})(?:\.([0-9]{0,18}))? ?([a-z]+) ?")
 _NORMAL_SINGLE = 2.0**-126  # floats of 32 bits below have fewer than six digits
 _WHOLE_FLOATS = 2.0**53  # from here on floats skip whole numbers
 _WHOLE_SINGLES = 2.0**24  # the same for floats of 32 bits
@@ -106,3 +110,18 @@ def are_apart(one: float, other: float, least: float, *, percent: bool = False) 
     if percent:
         exact = _DECIMALS.multiply(first.copy_abs(), _DECIMALS.divide(exact, Decimal(100)))
     return _DECIMALS.subtract(as_decimal(other), first).copy_abs() >= exact
+
+
+def nanoseconds(text: str) -> int | None:
+    """Returns `500ms`, `1.5 h`, `1h30m`, `1h 30min`; None for a text that is no duration."""
+    total, longest, at = 0, TIMES["w"] + 1, 0
+    while at < len(text) or not text:
+        match = _TIME.match(text, at)
+        if match is None or not (match[1] or match[2]):
+            return None
+        unit, fraction = TIMES.get(match[3], longest), match[2] or ""
+        if unit >= longest:  # unknown, or not shorter than the one before
+            return None
+        total += int(match[1] or 0) * unit + int(fraction or 0) * unit // 10 ** len(fraction)
+        longest, at = unit, match.end()
+    return total

@@ -5,6 +5,10 @@ from pathlib import Path
 import pytest
 
 from gateway.config import load
+from gateway.config.settings import parsers
+from gateway.config.sheets import cells
+from gateway.contract.keys import max_age
+from gateway.contract.past.timerange import time_range
 from gateway.errors import ConfigError
 from tests.cli.conftest import Command
 from tests.e2e.processes import plc_gateway
@@ -22,34 +26,115 @@ def devices(tag: str) -> str:
     return f"devices: {{mixer: {{protocol: vigor, station: 1, tags: {{{tag}}}}}}}"
 
 
+PLANT = """\
+gateway: {name: demo}
+lines:
+  hall-1:
+    port: simulator
+    devices:
+      mixer:
+        protocol: vigor
+        station: 1
+        tags:
+          a: {address: D1, scale: 0.1, unit: rpm}
+"""
+NBSP = "\xa0"
+MIXER = "lines.hall-1.devices.mixer"
+
+
 @pytest.mark.parametrize(
-    ("port", "sentence"),
+    ("right", "wrong", "sentence"),
     [
-        ("ttyUSB0", "ttyUSB0 is no port: did you mean /dev/ttyUSB0?"),
-        ("COM3", "COM3 is a port of Windows: here it is a path like /dev/ttyUSB0"),
-        (r"\\.\COM12", r"\\.\COM12 is a port of Windows: here it is a path like /dev/ttyUSB0"),
+        # numbers and their units
+        ("scale: 0.1", "scale: 0,1", "10: {a}.1: no setting of a tag: a number has a point, not a"),
+        ("scale: 0.1", 'scale: "0,1"', "10: {a}.scale: '0,1' is no number: write 0.1"),
+        ("scale: 0.1", 'every: "1,5s"', "10: {a}.every: '1,5s' is no duration: write 1.5s"),
+        ("scale: 0.1", "every: 5", "10: {a}.every: 5 has no unit: write 5s or 5ms"),
+        ("scale: 0.1", "every: 15M", "10: {a}.every: 15M: M is no unit of time: use min for min"),
+        ("scale: 0.1", "every: 30m1h", "10: {a}.every: '30m1h' is no duration: write 500ms, 2s, "),
+        ("scale: 0.1", 'every: "1,5,2s"', "10: {a}.every: '1,5,2s' is no duration: write 500ms,"),
+        ("station: 1", f"station: 1{NBSP}", r"8: {m}.station: '1\xa0' (\xa0 is a no-break space)"),
+        # ports and what is on them
+        ("simulator", "ttyUSB0", "4: lines.hall-1.port: ttyUSB0 is no port: did you mean /dev/tty"),
+        ("simulator", "COM3", "4: lines.hall-1.port: COM3 is a port of Windows: here it is a path"),
+        ("simulator", "COM 3", "4: lines.hall-1.port: COM 3 is a port of Windows: here it is a pa"),
+        ("simulator", r"\\.\COM12", r"4: lines.hall-1.port: \\.\COM12 is a port of Windows: here"),
         (
-            "192.168.0.7",
-            "192.168.0.7 is no port: write tcp://192.168.0.7:4001, with its port number",
+            "simulator",
+            "10.0.0.7",
+            "4: lines.hall-1.port: 10.0.0.7 is no port: write tcp://10.0.0.7",
+        ),
+        ("simulator", "simulator\n    format: 8N3", "5: lines.hall-1.format: '8N3' is no charact"),
+        ("simulator", "simulator\n    baudrate: 9601", "5: lines.hall-1.baudrate: 9601 is no bau"),
+        # addresses and words
+        ("D1", "X18", "10: {a}.address: X18: X and Y are numbered in octal, 8 and 9 do not exist"),
+        ("D1", "“D1”", "10: {a}.address: '“D1”' is no device address: write it as D100"),
+        ("rpm", "“rpm”", "10: {a}.unit: “rpm” has curly quotes: write 'rpm'"),
+        ("demo", "“demo”", "1: gateway.name: '“demo”' has '“': names are letters and digits"),
+        ("vigor", "vigour", "7: {m}.protocol: 'vigour' is no protocol: did you mean vigor?"),
+        ("vigor", f"vigor{NBSP}", r"7: {m}.protocol: 'vigor\xa0' (\xa0 is a no-break space) "),
+        ("scale: 0.1", "type: word", "10: {a}.type: 'word' is not a type: use bool, int8"),
+        ("scale", "scal", "10: {a}.scal: no setting of a tag: did you mean scale?"),
+        # the form of the file
+        ("station: 1", "station 1", "8: no colon after station: write station: 1"),
+        ("station: 1", "station = 1", "8: no colon after station: write station: 1"),
+        ("station: 1", "station:1", "8: no space after a colon: write station: 1"),
+        ("protocol: vigor", "protocol vigor", "7: no colon after protocol: write protocol: vigor"),
+        ("tags:", "tags", "9: no colon after tags: write tags:"),
+        ("a: {", "a {", "10: no colon after a: write a: {{address: D1, scale: 0.1, unit: rpm}}"),
+        ("address: D1", "address:D1", "10: {a}.address:D1: no setting of a tag: write a space aft"),
+        (
+            "        station",
+            f"{NBSP * 8}station",
+            "8: a no-break space, as web pages and Word have",
+        ),
+        ("station: 1", f"station:{NBSP}1", "8: a no-break space, as web pages and Word have it"),
+        ("        station", "\tstation", "8: a tab: YAML is indented with spaces"),
+        ("        station", "       station", "8: no YAML: while parsing a block mapping that beg"),
+        ("station: 1", "station: 1\n        station: 2", "8: {m}.station: written twice, here and"),
+        ("rpm}", "rpm", "11: no YAML: while parsing a flow mapping that begins in line 10"),
+        ("rpm", '"rpm', "11: no YAML: while scanning a quoted scalar that begins in line 10"),
+        (
+            "gateway:",
+            "<<<<<<< HEAD\ngateway:",
+            "1: <<<<<<< is a mark of a merge conflict: keep one of the two versions",
+        ),
+        (
+            "lines:",
+            "=======\nlines:",
+            "2: ======= is a mark of a merge conflict: keep one of the two versions",
         ),
     ],
 )
-def test_a_port_that_is_none(tmp_path: Path, port: str, sentence: str) -> None:
-    line = f"port: {port}\n    {devices('a: {address: D1}')}"
-    assert refused(tmp_path, line) == f"3: lines.hall.port: {sentence}"
+def test_a_mistake_has_its_line_its_cause_and_what_is_right(
+    tmp_path: Path, right: str, wrong: str, sentence: str
+) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(PLANT.replace(right, wrong, 1))
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    said = str(caught.value).replace(f"{path}:", "").splitlines()
+    expected = sentence.format(m=MIXER, a=f"{MIXER}.tags.a")
+    assert any(line.startswith(expected) for line in said), said
 
 
 @pytest.mark.parametrize(
-    ("setting", "sentence"),
-    [
-        ('scale: "0,1"', "'0,1' is no number: write 0.1"),
-        ('every: "1,5s"', "'1,5s' is no duration: write 1.5s"),
-        ('every: "1,5,2s"', "'1,5,2s' is no duration: write 500ms, 2s, 15min, 1h or 7d"),
-    ],
+    ("text", "seconds"),
+    [("15m", 900), ("15min", 900), ("1h30m", 5400), ("1h 30 min", 5400), ("1d12h", 129_600)],
 )
-def test_a_decimal_comma(tmp_path: Path, setting: str, sentence: str) -> None:
-    line = f"port: simulator\n    {devices(f'a: {{address: D1, {setting}}}')}"
-    assert refused(tmp_path, line).endswith(f": {sentence}")
+def test_a_duration_is_the_same_in_file_sheet_range_and_query(text: str, seconds: int) -> None:
+    assert parsers.duration(text) == max_age(text) == seconds
+    assert parsers.duration(cells.duration(text, "")) == seconds
+    now = 10**18
+    for asked in (text, f"[now(-{text})..]"):
+        assert time_range(asked, now).first == now - seconds * 10**9
+
+
+def test_a_history_larger_than_its_disk_is_a_warning(command: Command, tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(f"{PLANT}history: {{path: h.db, max_size: 900TB}}\n")
+    warning = command("check", path).err
+    assert "warning: history.max_size: 900000 GB, but the disk of " in warning
 
 
 def test_one_port_under_two_names(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The `check` command: validates the file and prints the plan of each line."""
 
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Annotated
@@ -19,6 +20,7 @@ from gateway.config.messages import dotted
 from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.parts.doors.plan import door_plans, door_warnings
+from gateway.parts.history.settings import HistorySection
 from gateway.parts.history.store.place import trouble
 from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
 from gateway.parts.web import exposure
@@ -57,7 +59,7 @@ def check(
         out.print(part)
     for note in _notes(loaded):
         err.print(f"note: {note}")
-    warnings += door_warnings(loaded, lines)
+    warnings += [*door_warnings(loaded, lines), *_too_large(loaded)]
     by_name = {line.name: line for line in loaded.lines}
     warnings += [text for one in lines for text in modem_warnings(by_name[one.name], one)]
     for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
@@ -136,6 +138,18 @@ def _notes(config: Config) -> Iterator[str]:
         )
     for sheet in config.sheets:
         yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
+
+
+def _too_large(config: Config) -> Iterator[str]:
+    """Yields a warning for a history that its disk cannot hold."""
+    history = config.part(HistorySection)
+    if history is not None and (folder := history.path.resolve().parent).is_dir():
+        whole = shutil.disk_usage(folder).total
+        if history.max_size > whole:
+            yield (
+                f"history.max_size: {history.max_size / 1e9:.0f} GB, but the disk of "
+                f"{history.path} has {whole / 1e9:.0f} GB: the history fills it before it ends"
+            )
 
 
 def _unwritable(config: Config) -> Iterator[str]:

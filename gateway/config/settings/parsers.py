@@ -11,7 +11,7 @@ from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import Literal
 
-from gateway.config.messages import one_of, shown
+from gateway.config.messages import shown
 from gateway.errors import ConfigError
 from gateway.files import is_name
 from gateway.protocols.frames.bytetext import octets
@@ -23,19 +23,20 @@ from gateway.transport.port import (
     parse_port,
 )
 from gateway.values import ValueType, parse_type
+from gateway.values.numerals import TIMES, nanoseconds
 
-_DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
+_WITH_UNIT = re.compile(r"[0-9.]+ ?([A-Za-zµ]+)\Z")
 _COMMA = re.compile(r"-?[0-9]+,[0-9]+ ?[A-Za-zµ%]*\Z")
-SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]B)\Z")
 BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_CURLY = "“”„‟‘’‚«»"
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _SERVER = re.compile(r"(?:([^/\\:\s]+):)?([0-9]+)\Z")  # as in its manual: `4001`, `10.0.0.7:4001`
 _HOST = re.compile(r"[0-9]{1,3}(?:\.[0-9]{1,3}){3}\Z")
-_WINDOWS = re.compile(r"(?:\\\\\.\\)?COM[0-9]+\Z", re.IGNORECASE)
+_WINDOWS = re.compile(r"(?:\\\\\.\\)?COM ?[0-9]+\Z", re.IGNORECASE)
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
 # Rates of serial ports and PLCs; a typing mistake is rarely one of them.
 BAUDRATES = (
@@ -45,23 +46,22 @@ BAUDRATES = (
 )
 _LONGEST_TIME = 3650 * 86400.0  # ten years; more is a mistake, and clocks overflow
 
-DURATIONS = "500ms, 2s, 15min, 1h or 7d"
+DURATIONS = "500ms, 2s, 15min, 1h30m or 7d"
 
 
 def duration(text: object) -> float:
-    """Parses `500ms` as 0.5 seconds. Refuses a number without unit."""
+    """Parses `500ms` as 0.5 seconds, and `1h30m`. Refuses a number without unit."""
     if isinstance(text, (int, float)) and not isinstance(text, bool) and 0 < text < _LONGEST_TIME:
         number = shown(text)
         raise ConfigError(f"{number} has no unit: write {number}s or {number}ms")
-    match = _DURATION.match(text) if isinstance(text, str) else None
-    if match is None:
+    time = nanoseconds(text) if isinstance(text, str) else None
+    if time is None:
+        if isinstance(text, str) and (match := _WITH_UNIT.match(text)) and match[1] not in TIMES:
+            hint = "min for minutes" if match[1] == "M" else "ms, s, min, h or d"
+            raise ConfigError(f"{text}: {match[1]} is no unit of time: use {hint}")
         write = with_point(text) or DURATIONS
         raise ConfigError(f"{shown(text)} is no duration: write {write}")
-    if match[2] not in SECONDS:
-        hint = f"{match[1]}min for minutes" if match[2] in "mM" else one_of(SECONDS)
-        raise ConfigError(f"{text}: {match[2]} is no unit of time: use {hint}")
-    # By tenths of a millisecond, so that 1.1s is the number a person would write.
-    seconds = round(float(match[1]) * SECONDS[match[2]], 7)
+    seconds = round(time / 10**9, 7)
     if seconds > _LONGEST_TIME:
         raise ConfigError(f"{text} is longer than ten years")
     return seconds
@@ -72,6 +72,14 @@ def with_point(text: object) -> str | None:
     if isinstance(text, str) and _COMMA.match(text):
         return text.replace(",", ".")
     return None
+
+
+def unit(text: object) -> str:
+    """Parses a unit of measurement."""
+    plain = _text(text)
+    if {*plain[:1], *plain[-1:]} & {*_CURLY}:
+        raise ConfigError(f"{plain} has curly quotes: write {plain.strip(_CURLY)!r}")
+    return plain
 
 
 def interval(text: object) -> float:

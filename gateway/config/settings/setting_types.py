@@ -43,11 +43,11 @@ def member(kind: type[StrEnum], wrong: str = "is not known") -> Parsed:
 
 DURATION_SCHEMA: dict[str, Any] = {
     "type": "string",
-    "pattern": r"^[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$",
-    "examples": ["500ms", "2s", "15min", "1h", "7d"],
+    "pattern": r"^([0-9]+(\.[0-9]+)? ?(w|d|h|min|m|s|ms|us) ?)+$",
+    "examples": ["500ms", "2s", "15min", "1h30m", "7d"],
 }
 INTERVAL_SCHEMA = DURATION_SCHEMA | {
-    "pattern": r"^(?=[0-9.]*[1-9])[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$"
+    "pattern": r"^(?=.*[1-9])([0-9]+(\.[0-9]+)? ?(w|d|h|min|m|s|ms|us) ?)+$"
 }
 # To an editor `40101` as an address and `true` as a unit are a number and a boolean.
 TEXT_SCHEMA: dict[str, Any] = {"type": ["string", "number", "boolean"]}
@@ -104,6 +104,7 @@ _PORT_SCHEMA = {
 Duration = Annotated[float, Parsed(parsers.duration, DURATION_SCHEMA)]
 Interval = Annotated[float, Parsed(parsers.interval, INTERVAL_SCHEMA)]
 Text = Annotated[str, Field(strict=True), WithJsonSchema(TEXT_SCHEMA)]
+Unit = Annotated[str, Parsed(parsers.unit, TEXT_SCHEMA)]
 Name = Annotated[str, Parsed(parsers.name, TEXT_SCHEMA | {"pattern": NAME_PATTERN})]
 Group = Annotated[str, Parsed(parsers.name, {"type": "string", "pattern": NAME_PATTERN})]
 Prefix = Annotated[

@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from gateway.errors import ConfigError
+from gateway.values.numerals import nanoseconds
 
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][-+]?[0-9]+)?\Z")
 # 1.000 and 1,000: a point or a comma, and both a decimal mark and one between thousands.
@@ -123,6 +124,8 @@ def kind(text: str, length: str) -> str | None:
 
 def duration(text: str, unit: str) -> str | int | float:
     """Returns `500 ms`, `0,5s`, `1 Sek` as durations. `unit`: of a number alone, if known."""
+    if nanoseconds(text) is not None:
+        return text
     if match := _TIME.match(text):
         return match[1].replace(",", ".") + str(words("times").get(match[2].casefold(), match[2]))
     value = number(text, "." if "." in text else ",")

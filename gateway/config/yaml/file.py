@@ -4,6 +4,7 @@ A key is always a text. A key written twice is a mistake, and so is anything tha
 to a Python program. A plain file is read as a stream; its tree is made for the lines of mistakes.
 """
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -254,6 +255,8 @@ def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
         return f"{name}:{line}: an alias (*) without its anchor (&) before it"
     if problem == _TOO_DEEP:
         return f"{name}:{line}: {problem}"
+    if slip := next(filter(None, (_slip(rows, near) for near in _near(error, line))), None):
+        return f"{name}:{slip}"
     context = error.context or ""
     begun = ""
     if error.context_mark and _line(error.context_mark) != line:
@@ -261,6 +264,32 @@ def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
     message = f"{context}{begun}, {problem}" if context else problem
     remedies = (remedy for word, remedy in _REMEDIES.items() if word in message)
     return f"{name}:{line}: no YAML: {': '.join([message, *islice(remedies, 1)])}"
+
+
+# One slip of the hand in a line that YAML does not understand, and what is right.
+_CONFLICT = re.compile(r"(<{7}|={7}|>{7}|\|{7})(?: |\Z)")
+_NO_SPACE = re.compile(r"\s*(?:- )?(\w[\w./-]{0,99}):([^\s/:].{0,99})\Z")
+_NO_COLON = re.compile(r"\s*(\w[\w./-]{0,99})(?: +=?| *\Z)([^:#]{0,99}|[\[{].{0,99})\Z")
+
+
+def _near(error: yaml.MarkedYAMLError, line: int) -> Iterator[int]:
+    """Yields the lines in which the cause of a mistake may be; the likely ones first."""
+    begun = _line(error.context_mark) if error.context_mark else line
+    yield from dict.fromkeys((begun, line - 1, line) if begun != line else (line - 1, line))
+
+
+def _slip(rows: list[str], line: int) -> str:
+    """Returns the line and what is wrong in it; empty for a line without a known slip."""
+    row = rows[line - 1] if 0 < line <= len(rows) else ""
+    if match := _CONFLICT.match(row):
+        return f"{line}: {match[1]} is a mark of a merge conflict: keep one of the two versions"
+    if "\xa0" in row:
+        return f"{line}: a no-break space, as web pages and Word have it: write a plain space"
+    if match := _NO_SPACE.match(row):
+        return f"{line}: no space after a colon: write {match[1]}: {match[2]}"
+    if match := _NO_COLON.match(row):
+        return f"{line}: no colon after {match[1]}: write {match[1]}: {match[2].strip()}".strip()
+    return ""
 
 
 def _line(mark: Any) -> int:

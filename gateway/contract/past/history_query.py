@@ -66,9 +66,8 @@ def question(parameters: Mapping[str, str], time: str = "_time") -> HistoryQuery
 
 
 def _width(text: str) -> int:
-    """`1min` as in the configuration, `1m` as in a range of time."""
     try:
-        width = duration(f"{text[:-3]}m" if text.endswith("min") else text)
+        width = duration(text)
     except BadValue:
         raise BadValue(f"bucket={text[:40]} is no duration such as 10s, 1min or 1h") from None
     if not 0 < width <= _LONGEST:

@@ -1,8 +1,8 @@
 """Zenoh's `_time` ranges: `[now(-1h)..]`, `[2026-11-20T12:00:00Z..now()]`, `]a..b[`, `[..]`.
 
 `[a` and `b]` include the bound, `]a` and `b[` exclude it; a missing bound is open. A bound is
-RFC 3339 (UTC without a zone), `now()` or `now(-1h)`, with durations in u, ms, s, m, h, d, w;
-seconds without a unit.
+RFC 3339 (UTC without a zone; a day or a minute is its beginning), `now()` or `now(-1h)`; a number
+alone is seconds. A duration alone is the time until now.
 """
 
 import re
@@ -10,24 +10,14 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from gateway.errors import BadValue
+from gateway.values.numerals import nanoseconds
 
 EARLIEST, LATEST = -(2**63), 2**63 - 1  # of a 64-bit column: the years 1677 to 2262
 
-_UNITS = {
-    "u": 10**3,
-    "ms": 10**6,
-    "": 10**9,
-    "s": 10**9,
-    "m": 60 * 10**9,
-    "h": 3600 * 10**9,
-    "d": 86400 * 10**9,
-    "w": 7 * 86400 * 10**9,
-}
 _NOW = re.compile(r"now\(([+-]?)(.*)\)\Z")
-_DURATION = re.compile(r"([0-9]{1,18})?(?:\.([0-9]{0,18}))?(u|ms|s|m|h|d|w|)\Z")
 _RFC3339 = re.compile(
-    r"([0-9]{4}-[0-9]{2}-[0-9]{2})[T ]([0-9]{2}:[0-9]{2}:[0-9]{2})"
-    r"(?:\.([0-9]{1,9}))?(Z|[+-][0-9]{2}:[0-9]{2})?\Z"
+    r"([0-9]{4}-[0-9]{2}-[0-9]{2})(?:[T ]([0-9]{2}:[0-9]{2}(?::[0-9]{2})?)"
+    r"(?:\.([0-9]{1,9}))?(Z|[+-][0-9]{2}:[0-9]{2})?)?\Z"
 )
 
 
@@ -40,6 +30,8 @@ class TimeRange(NamedTuple):
 
 def time_range(text: str, now: int) -> TimeRange:
     """Parses the text of `_time=`; `now`: ns since 1970. Raises `BadValue`."""
+    if nanoseconds(text):
+        text = f"[now(-{text})..]"
     if len(text) < 4 or text[0] not in "[]" or text[-1] not in "[]" or ".." not in text:
         raise BadValue(f"_time={_short(text)} is no range such as [now(-1h)..] or [start..end]")
     start, _, end = text[1:-1].partition("..")
@@ -62,7 +54,7 @@ def _bound(text: str, now: int) -> int:
         date, clock, fraction, zone = match.groups()
         zone = "+00:00" if zone in (None, "Z") else zone
         try:
-            moment = datetime.fromisoformat(f"{date}T{clock}{zone}")
+            moment = datetime.fromisoformat(f"{date}T{clock or '00:00'}{zone}")
         except ValueError:
             raise BadValue(f"{_short(text)} is no time of the calendar") from None
         since = moment - datetime(1970, 1, 1, tzinfo=UTC)
@@ -73,11 +65,10 @@ def _bound(text: str, now: int) -> int:
 
 def duration(text: str) -> int:
     """Returns ns. Raises `BadValue`."""
-    match = _DURATION.match(text)
-    if match is None or not (match[1] or match[2]):
-        raise BadValue(f"{_short(text)} is no duration such as 500ms, 30m or 1.5h")
-    unit, fraction = _UNITS[match[3]], match[2] or ""
-    return int(match[1] or 0) * unit + int(fraction or 0) * unit // int(f"1{'0' * len(fraction)}")
+    time = nanoseconds(f"{text}s" if text[-1:].isdigit() else text)
+    if time is None:
+        raise BadValue(f"{_short(text)} is no duration such as 500ms, 30m or 1h30m")
+    return time
 
 
 def _clamped(time: int) -> int:

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from gateway.config.settings.setting_types import Text
+from gateway.config.settings.setting_types import Text, Unit
 from gateway.config.tags.features.feature import Facts, Feature, Settings
 from gateway.tags import Label, Tag
 
 
 class LabelSettings(Settings):
-    unit: Text = ""
+    unit: Unit = ""
     """The unit of the value, for people: rpm, °C."""
     description: Text = ""
     """A description, for people."""
