@@ -2,9 +2,9 @@
 
 Three routers are linked to each other; a client is connected to the last one. A session without a
 gateway, as a client, peer or router that knows two or three of them, publishes five values a second
-and has a token. The program kills the first router, starts it again, and counts in how many rounds
-the client missed values for three seconds, received values twice, or did not see the token
-afterwards.
+and has a token and a queryable. The program kills the first router, starts it again, and counts in
+how many rounds the client missed values for three seconds, received values twice, did not see the
+token afterwards, or asked in vain, before or after the router returned.
 """
 
 import argparse
@@ -21,6 +21,7 @@ class Round(NamedTuple):
     stopped: bool  # no value arrived while the router was away
     twice: bool
     lost_token: bool
+    unanswered: bool
 
 
 async def play(mode: str, known: int, dead: float, back: float) -> Round:
@@ -34,6 +35,7 @@ async def play(mode: str, known: int, dead: float, back: float) -> Round:
         client = await start(ZenohPeer("client", connect=ends[2:]))
         source = await start(ZenohPeer(mode, connect=ends[:known]))
         await source.declare_token("alive")
+        asked = await source.queryable("asked")
         tokens, values = await client.liveliness("alive"), await client.subscribe("value")
 
         ended = asyncio.Event()
@@ -45,6 +47,16 @@ async def play(mode: str, known: int, dead: float, back: float) -> Round:
                 await source.put("value", str(number).encode())
                 await asyncio.sleep(EVERY)
 
+        async def arrives() -> bool:
+            """Asks once; whether the publisher heard it."""
+            known = len(asked.samples)
+            await client.get("asked")
+            for _ in range(20):
+                if len(asked.samples) > known:
+                    return True
+                await asyncio.sleep(0.05)
+            return False
+
         publishing = asyncio.create_task(publish())
         await values.next(lambda _: True)
         await asyncio.sleep(1.0)
@@ -52,13 +64,16 @@ async def play(mode: str, known: int, dead: float, back: float) -> Round:
         await first.kill()
         await asyncio.sleep(dead)
         stopped = len(values.samples) - before < dead / EVERY / 2
+        heard = await arrives()
         await start(ZenohPeer("router", ends[:1], ends[1:]))
         await asyncio.sleep(back)
+        heard = await arrives() and heard
         ended.set()
         await publishing
         numbers = [sample.payload for sample in values.samples]
         is_alive = tokens.samples[-1].kind == "PUT"
-        return Round(stopped, len(numbers) > len(set(numbers)), not is_alive)
+        twice = len(numbers) > len(set(numbers))
+        return Round(stopped, twice, not is_alive, not heard)
 
 
 async def main() -> None:
@@ -69,8 +84,8 @@ async def main() -> None:
     parser.add_argument("--back", type=float, default=4.0, help="seconds with it again")
     options = parser.parse_args()
     rounds = options.rounds
-    print("| mode | routers | rounds | values stopped | values twice | token lost |")
-    print("|---|---|---|---|---|---|")
+    print("| mode | routers | rounds | values stopped | values twice | token lost | unanswered |")
+    print("|---|---|---|---|---|---|---|")
     for mode, known in ((mode, known) for mode in options.modes for known in (2, 3)):
         found = [await play(mode, known, options.dead, options.back) for _ in range(rounds)]
         counts = " | ".join(str(sum(column)) for column in zip(*found, strict=True))

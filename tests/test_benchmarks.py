@@ -78,7 +78,7 @@ TINY = [
     (
         "routers",
         "--rounds 1 --modes client --dead 0.5 --back 0.5",
-        [r"^\| client \| 2 \| 1 \| [01] \| [01] \| [01] \|$"],
+        [r"^\| client \| 2 \| 1 \| [01] \| [01] \| [01] \| [01] \|$"],
     ),
     (
         "device_servers",

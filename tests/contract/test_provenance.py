@@ -80,10 +80,10 @@ def bridges(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
             sys.modules.pop(path.stem, None)
 
 
-def shown(tag: Tag, value: int, folder: Path, bridges: dict[str, Any]) -> dict[str, str]:
+def shown(sample: Sample, folder: Path, bridges: dict[str, Any]) -> dict[str, str]:
     """What the ways show beside the value, as the page has it."""
-    sample = good(tag, value, NOON) if tag.origin.inputs else converted(tag, value, NOON)
-    with history(folder / f"{tag.name}.db") as historian:
+    tag = sample.tag
+    with history(folder / f"{tag.name}-{sample.quality}.db") as historian:
         historian.record([sample])
         [past] = historian.samples(tag, EVERYTHING, None)
         asked, now = HistoryQuery(EVERYTHING, bucket=SECOND), Now(NOON + 1, is_valid=True)
@@ -117,7 +117,7 @@ def _of_opcua(opcua: Any, tag: Tag, known: dict[str, Any]) -> str:
         getattr(opcua.Code, name): name
         for name in (
             *("Good", "GoodEdited", "GoodLocalOverride"),
-            "UncertainEngineeringUnitsExceeded",
+            *("UncertainEngineeringUnitsExceeded", "BadConfigurationError"),
         )
     }
     bits = {0: "", 0x500: ", limit bits low", 0x600: ", limit bits high"}
@@ -149,9 +149,16 @@ def test_the_table_of_the_page_is_what_each_way_shows(
     tags: dict[str, Tag], tmp_path: Path, bridges: dict[str, Any]
 ) -> None:
     origins = ("simulated", "replayed", "held", "computed")
-    ends = {"clamped": 100, "ranged": 51}
+    ends = {"clamped": 100, "ranged": 51, "swapped": 7}
     values = {"plain": 7, **dict.fromkeys((*origins, "counted"), 7), **ends}
-    found = {name: shown(tags[name], value, tmp_path, bridges) for name, value in values.items()}
+    samples = {
+        name: good(tags[name], value, NOON)
+        if tags[name].origin.inputs
+        else converted(tags[name], value, NOON)
+        for name, value in values.items()
+        if name != "swapped"
+    } | {"swapped": bad(tags["plain"], Reason.WRONG_DEVICE, NOON)}
+    found = {name: shown(sample, tmp_path, bridges) for name, sample in samples.items()}
     rows = [
         f"| {way} | {' | '.join(found[name][way] or '–' for name in columns)} |"
         for columns in (("plain", *origins), ends)
@@ -166,7 +173,7 @@ def test_the_table_of_the_page_is_what_each_way_shows(
         return {way for way, text in found[name].items() if text in ("", "good", "Good")}
 
     assert [silent(name) for name in origins] == [set(), set(), set(), {"OPC UA"}]
-    assert silent("ranged") == {"`@meta`"}
+    assert silent("ranged") == silent("swapped") == {"`@meta`"}
 
 
 @pytest.mark.parametrize(
