@@ -1,6 +1,7 @@
 """Which HTTP requests are answered: names of the machine, origins, tokens, limits."""
 
 import asyncio
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,27 @@ async def test_pages_of_other_sites_get_nothing() -> None:
             assert (await client.ask("/metrics", Origin=origin)).status == 403
         assert (await client.ask("/metrics", Sec_Fetch_Site="cross-site")).status == 403
         assert (await client.ask("/metrics", Sec_Fetch_Site="same-origin")).status == 200
+
+
+async def test_pages_of_a_listed_origin_may_read_and_write_with_a_token(tokens: Path) -> None:
+    hmi, allowed = "http://hmi.plant:3000", "Access-Control-Allow-Origin"
+    async with serving(host="0.0.0.0", tokens_file=tokens, origins=[hmi]) as client:
+        asked = await client.ask(
+            "/api/write", "OPTIONS", Origin=hmi, Access_Control_Request_Method="POST"
+        )
+        assert (asked.status, asked.headers[allowed]) == (204, hmi)
+        assert asked.headers["Access-Control-Allow-Headers"] == "authorization, content-type"
+        ask = partial(client.ask, "/api/tags", Origin=hmi, Sec_Fetch_Site="cross-site")
+        refused = await ask()
+        assert (refused.status, refused.headers[allowed]) == (401, hmi)  # its page sees why
+        known = await ask(Authorization=f"Bearer {TOKEN}")
+        assert (known.status, known.headers["Vary"]) == (200, "Origin")
+        assert (await ask(Host="evil.example")).status == 421
+        for origin in (f"{hmi}1", "https://hmi.plant:3000", "null", "http://evil.example"):
+            for method in ("OPTIONS", "GET", "POST"):
+                other = await client.ask("/api/tags", method, Origin=origin)
+                assert (other.status, other.headers.get(allowed)) == (403, None)
+        assert (await client.ask("/api/tags", "OPTIONS")).status == 401
 
 
 async def test_other_addresses_need_a_token_for_every_value(tokens: Path) -> None:

@@ -319,3 +319,37 @@ async def proxy(client: Client, path: str) -> AsyncIterator[int]:
             yield port
         finally:
             await runner.cleanup()
+
+
+async def test_a_small_page_of_another_place_shows_and_writes(tab: Tab, tokens: Path) -> None:
+    """examples/hmi.html, from a server of its own; at an origin that is not listed it is blind."""
+    app = web.Application()
+    app.router.add_static("/", Path(__file__).parents[2] / "examples")
+    runner, port = web.AppRunner(app), free_port()
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.1", port).start()
+    speed = 'document.getElementById("mixer/speed").textContent'
+    origins = [f"http://127.0.0.1:{port}"]
+    async with serving(tokens_file=tokens, origins=origins) as client:
+        client.plant.now("mixer/speed", 57.7)
+        client.north.endings[b"7"] = WriteResult(7, 0, 0.03, verified=False)
+        page = f"hmi.html?gateway=http://127.0.0.1:{client.port}"
+        await tab.open(f"http://127.0.0.1:{port}/{page}")
+        await tab.until(f'{speed} === "57.7"')
+        client.plant.samples["mixer/speed"] = bad(
+            client.plant.samples["mixer/speed"].tag, Reason.NO_REPLY, time.time_ns()
+        )
+        await tab.until(f'{speed}.startsWith("bad: no-reply")')
+        for token, told in (("wrong", "not written: a token is needed"), (TOKEN, "acknowledged")):
+            form = f'document.forms[0].value.value = 7; document.forms[0].token.value = "{token}"'
+            await tab.value(f"{form}; document.forms[0].requestSubmit()")
+            await tab.until(f'document.forms[0].told.value.startsWith("{told}")')
+        assert client.north.written == [("mixer/recipe", b"7", "web alice")]
+        await tab.open(f"http://localhost:{port}/{page}")
+        await tab.until(f'{speed} === "not live"')
+        tab.errors.clear()  # the browser says that it refused
+        await tab.open(f"http://127.0.0.1:{port}/{page}")
+        await tab.until(f'{speed}.startsWith("bad")')
+    await tab.until(f'{speed} === "not live"')
+    tab.errors.clear()
+    await runner.cleanup()

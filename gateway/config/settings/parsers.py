@@ -32,6 +32,7 @@ BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _CURLY = "“”„‟‘’‚«»"
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
+_ORIGIN = re.compile(r"https?://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:[0-9]{1,5})?\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _SERVER = re.compile(r"(?:([^/\\:\s]+):)?([0-9]+)\Z")  # as in its manual: `4001`, `10.0.0.7:4001`
@@ -173,6 +174,16 @@ def web_address(text: object) -> tuple[str, int]:
     if match is None or not 1 <= int(match[2]) <= 65535:
         raise ConfigError(f"{shown(text)} is no address to listen on: write 127.0.0.1:8080")
     return match[1].strip("[]"), int(match[2])
+
+
+def origin(text: object) -> str:
+    """Parses `https://hmi.plant`, as a browser names the place of a page."""
+    if not isinstance(text, str) or not _ORIGIN.match(text):
+        raise ConfigError(
+            f"{shown(text)} is no origin: write https://hmi.plant or http://10.0.0.5:3000, "
+            "without a path"
+        )
+    return text.lower()
 
 
 def host_name(text: object) -> str:

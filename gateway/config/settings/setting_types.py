@@ -118,6 +118,9 @@ WebAddress = Annotated[
     tuple[str, int],
     Parsed(parsers.web_address, {"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
 ]
+WebOrigin = Annotated[
+    str, Parsed(parsers.origin, {"type": "string", "pattern": r"^https?://[^/\s*]+$"})
+]
 HostName = Annotated[
     str,
     Parsed(

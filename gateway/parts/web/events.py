@@ -98,7 +98,7 @@ class Events:
             Route(
                 "/api/events",
                 self.handle,
-                "Server-sent events of the status page; their content may change",
+                "Server-sent events: `values`, as docs/page.md has them; others may change",
                 parameters=(_LINE, _CHOSEN),
                 kind="text/event-stream",
                 done="Events",

@@ -35,6 +35,11 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Server": "plc-gateway",
 }
+_PREFLIGHT = {
+    "Access-Control-Allow-Methods": "GET, POST",
+    "Access-Control-Allow-Headers": "authorization, content-type",
+    "Access-Control-Max-Age": "600",
+}
 
 
 class Guard:
@@ -45,6 +50,7 @@ class Guard:
         if config.tokens_file is not None:
             self._tokens = NamedSecrets(config.tokens_file, "web.tokens_file")
         self._reads_need_token = not config.is_local
+        self._origins = frozenset(config.origins)
         self._names = {"localhost", socket.gethostname().lower(), *config.names}
         self._connections = connections
         self._requests = Places(MOST_OPEN, MOST_OF_CLIENT, "requests")
@@ -67,6 +73,8 @@ class Guard:
         """Answers in a place of its kind, which is taken until the client has the answer."""
         if (refusal := self._refusal(request, is_open)) is not None:
             return await send(request, refusal)
+        if self._is_preflight(request):
+            return await send(request, web.Response(status=204))
         if is_open:
             return await send(request, await _outcome(request, handler))
         places = self._scrapes if request.path == "/metrics" else self._requests
@@ -79,20 +87,41 @@ class Guard:
     def _refusal(self, request: web.Request, is_open: bool) -> web.Response | None:
         if not self._is_known(request.host):
             return answer(421, f"unknown name {request.host[:100]!r}: see web.names")
-        if not _is_same_site(request):
+        if not self._is_listed(request) and not _is_same_site(request):
             return answer(403, "pages of other sites may not use the gateway")
         if not request.headers.get("Authorization", "").isascii():
             return answer(400, "Authorization is no ASCII text")
         if len(request.query) > len({*request.query}):
             return answer(400, "a parameter is there twice")
         request[BY] = self._name(request)
-        if not is_open and self._needs_token(request) and not request[BY]:
+        if (
+            not is_open
+            and not self._is_preflight(request)
+            and self._needs_token(request)
+            and not request[BY]
+        ):
             if self._tokens is None:
                 return answer(403, "nothing can be written here: the file has no web.tokens_file")
             refusal = answer(401, "a token is needed: send Authorization: Bearer <token>")
             refusal.headers["WWW-Authenticate"] = "Bearer"
             return refusal
         return None
+
+    def _is_listed(self, request: web.Request) -> bool:
+        return request.headers.get("Origin", "").lower() in self._origins
+
+    def _is_preflight(self, request: web.Request) -> bool:
+        """True where the browser asks on behalf of a listed page: it sends no token itself."""
+        return request.method == "OPTIONS" and self._is_listed(request)
+
+    async def add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
+        """Called before the headers of each answer are sent."""
+        response.headers.update(_HEADERS)
+        if self._is_listed(request):
+            response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
+            response.headers["Vary"] = "Origin"
+        if self._is_preflight(request):
+            response.headers.update(_PREFLIGHT)
 
     def who(self, request: web.Request) -> Who | None:
         """Returns the client of a request; None when its token was withdrawn since."""
@@ -143,8 +172,3 @@ def _is_same_site(request: web.Request) -> bool:
         return True
     scheme, _, host = origin.partition("://")
     return scheme in ("http", "https") and host.lower() == request.host.lower()
-
-
-async def add_headers(_: web.Request, response: web.StreamResponse) -> None:
-    """Called before the headers of each answer are sent."""
-    response.headers.update(_HEADERS)

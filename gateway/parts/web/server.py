@@ -25,7 +25,7 @@ from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events, Loads
-from gateway.parts.web.guard import Guard, add_headers
+from gateway.parts.web.guard import Guard
 from gateway.parts.web.routes import Route
 from gateway.parts.web.settings import WebSection
 from gateway.parts.web.tag_list import TagList
@@ -98,7 +98,7 @@ class Server:
         self._app = web.Application(
             middlewares=[guard.middleware(is_open)], client_max_size=64 * 1024
         )
-        self._app.on_response_prepare.append(add_headers)
+        self._app.on_response_prepare.append(guard.add_headers)
         self._app.add_routes([route.registered() for route in routes])
 
     async def run(self) -> None:

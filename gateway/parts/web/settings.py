@@ -6,7 +6,7 @@ from typing import Any
 
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
-from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress
+from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress, WebOrigin
 from gateway.transport.port import is_loopback
 
 
@@ -33,6 +33,8 @@ class WebSection(Section):
     alarm, a history or a unit."""
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
+    origins: list[WebOrigin] = []
+    """Where pages of an HMI come from that may use the gateway, such as https://hmi.plant."""
 
     @property
     def host(self) -> str:
