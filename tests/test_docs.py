@@ -153,6 +153,7 @@ def test_every_page_with_files_is_checked() -> None:
             "device-servers.md",
             "share.md",
             "notify.md",
+            "connections.md",
         ),
         *("modem.md", "transfers.md"),
         *("templates.md", "trace.md", "alarms.md", "arrays.md"),
@@ -168,6 +169,8 @@ def test_every_page_with_files_is_checked() -> None:
 def test_a_file_in_the_pages_loads(block: Block, tmp_path: Path) -> None:
     for name in re.findall(r"[\w.-]+\.csv\b", block.text):
         (tmp_path / name).write_text("Name,Address\nspeed,D100\n")  # sheets of tags
+    for name in re.findall(r"[\w.-]+\.(?:pem|key)\b", block.text):
+        (tmp_path / name).touch()
     assert loaded(block.text, tmp_path).devices
 
 

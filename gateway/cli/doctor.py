@@ -26,7 +26,7 @@ from gateway.config import Config, LineConfig, load
 from gateway.config.loading import written
 from gateway.config.messages import dotted
 from gateway.contract.faults import faults
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, LineDown
 from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.parts.history.settings import HistorySection
 from gateway.parts.history.store.place import trouble
@@ -41,6 +41,7 @@ from gateway.transport.port import (
 )
 
 _WITHIN = 3.0  # seconds for a connection
+_REFUSES_WITHIN = 0.5  # seconds
 _SLOW_LATENCY = 1  # ms of an FTDI adapter; 16 by default
 _UNSYNCHRONISED = 5  # result of `adjtimex`, Linux
 _OTHER_PORT = "another `port` in the file"
@@ -108,12 +109,26 @@ def _port(port: PortAddress, line: LineConfig, *, runs: bool) -> Iterator[Findin
         case SerialPath(path):
             yield from _serial(path, runs=runs)
         case TcpAddress(host, number) | Rfc2217Address(host, number) if not line.serve:
-            tried = socket.create_connection
-            yield _tried(port, runs, lambda: tried((host, number), _WITHIN), f"ping {host}")
+            yield _tried(port, runs, lambda: _connected(port), f"ping {host}")
         case TcpAddress(host, number) | ListenAddress(host, number):
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             served = socket.create_server
             yield _tried(port, runs, lambda: served((host, number), family=family), _OTHER_PORT)
+
+
+def _connected(port: TcpAddress | Rfc2217Address) -> socket.socket:
+    """Raises `OSError`, `LineDown`."""
+    found = socket.create_connection((port.host, port.port), _WITHIN)
+    if isinstance(port, TcpAddress) and (tls := port.tls) is not None:
+        from gateway.transport.tls import make_context  # it takes 10 ms
+
+        with found:
+            context = make_context(tls, serves=False)
+            found = context.wrap_socket(found, server_hostname=tls.name or port.host)
+            with suppress(TimeoutError):  # a refusal of TLS 1.3 comes after the handshake
+                found.settimeout(_REFUSES_WITHIN)
+                found.recv(1)
+    return found
 
 
 def _tried(
@@ -127,7 +142,7 @@ def _tried(
         return Finding(what, "not tried: the gateway uses it")
     try:
         attempt().close()
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, LineDown) as error:
         return Finding(what, str(line_down(what, error)).partition(": ")[2], mend, "bad")
     return Finding(what, "free to listen at" if mend == _OTHER_PORT else "can be connected to")
 

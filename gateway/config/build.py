@@ -157,7 +157,7 @@ class Builder:
             devices = [until_the_next_call(one, raw) for one in devices]
         return LineConfig(
             name=name,
-            port=port_of(line, path, self.mistakes),
+            port=port_of(line, self.folder, path, self.mistakes),
             serial=serial,
             wire=wire,
             echo=line.echo,

@@ -156,7 +156,7 @@ def written(config: Config) -> Iterator[Written]:
 
 
 def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
-    zenoh, tls = config.zenoh, config.zenoh.tls
+    zenoh = config.zenoh
     read = {
         "the configuration file": own,
         "zenoh.config_file": zenoh.config_file,
@@ -166,8 +166,8 @@ def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
         "gateway.secret_file": config.secret_file,
         **dict(reads(config.parts)),
     }
-    if tls is not None:
-        read |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}
-        read |= {"zenoh.tls.certificate": tls.certificate}
+    for name, tls in config.secured.items():
+        read |= {f"{name}.ca": tls.ca, f"{name}.key": tls.key}
+        read |= {f"{name}.certificate": tls.certificate, f"{name}.revoked": tls.revoked}
     yield from ((what, file) for what, file in read.items() if file is not None)
     yield from (("a sheet of tags", sheet.file) for sheet in config.sheets)

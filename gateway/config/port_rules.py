@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path as FilePath
 
 from gateway.config.messages import Mistakes, Path
 from gateway.config.settings.model import LineSection
+from gateway.config.settings.zenoh_records import tls_files
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.transport.port import (
@@ -14,15 +16,21 @@ from gateway.transport.port import (
     Rfc2217Address,
     SerialPath,
     TcpAddress,
+    TlsConfig,
 )
 from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
 LONGEST_CONNECT_DELAY = 10.0  # seconds
 
 
-def port_of(line: LineSection, path: Path, mistakes: Mistakes) -> PortAddress:
-    """Returns the port, with the device server that it waits for."""
+def port_of(line: LineSection, folder: FilePath, path: Path, mistakes: Mistakes) -> PortAddress:
+    """Returns the port, with its certificates and the device server that it waits for."""
     port, own = line.port, line.device_server
+    tls = None
+    if line.tls is not None:
+        tls = tls_files(line.tls.record(), folder, (*path, "tls"), mistakes)
+    if isinstance(port, TcpAddress) and port.tls is not None and tls is not None:
+        port = replace(port, tls=tls)
     if not isinstance(port, ListenAddress):
         if own is not None:
             text = "the line waits for no device server: its port is not listen://host:port"
@@ -31,19 +39,25 @@ def port_of(line: LineSection, path: Path, mistakes: Mistakes) -> PortAddress:
     if line.serve:
         text = "a line with `serve: true` is the one that listens: write the port as tcp://"
         mistakes.add((*path, "port"), text)
+    name = ""
+    if tls is not None:
+        name, port = tls.name, replace(port, tls=replace(tls, name=""))
     if own is None:
-        return port
-    return replace(
-        port, server=DeviceServer(own.registration or b"", own.heartbeat or b"", own.allow or ())
-    )
+        return replace(port, server=DeviceServer(name=name))
+    words = (own.registration or b"", own.heartbeat or b"")
+    return replace(port, server=DeviceServer(*words, own.allow or (), name))
 
 
 def check_device_servers(lines: Mapping[str, PortAddress], mistakes: Mistakes) -> None:
     """Refuses two lines that one device server could mean. `lines`: their ports by name."""
     met: dict[tuple[str, int], dict[str, bytes]] = {}
+    secured: dict[tuple[str, int], TlsConfig | None] = {}
     for name, port in lines.items():
         if not isinstance(port, ListenAddress):
             continue
+        if secured.setdefault((port.host, port.port), port.tls) != port.tls:
+            text = "another line has this port too: all have the same certificates, but `name`"
+            mistakes.add(("lines", name, "tls"), text)
         others = met.setdefault((port.host, port.port), {})
         mine, place = port.server.registration, ("lines", name, "device_server")
         for other, its in others.items():
@@ -53,6 +67,35 @@ def check_device_servers(lines: Mapping[str, PortAddress], mistakes: Mistakes) -
                 mistakes.add(place, text)
                 break
         others[name] = mine
+
+
+def check_tls(
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """The side that connects needs an authority, the other one a certificate."""
+    port, own, place = line.port, line.tls, (*path, "tls")
+    secured = isinstance(port, TcpAddress) and port.tls is not None
+    masters = line.serve and any(one.driver.traits.over_network for one in devices)
+    listens = masters or isinstance(port, ListenAddress)
+    if own is None:
+        if secured:
+            need = "certificate: gateway.pem, key: gateway.key" if listens else "ca: ca.pem"
+            mistakes.add(place, f"missing: a port tls:// needs `tls: {{{need}}}`")
+        return
+    if not secured and not isinstance(port, ListenAddress):
+        mistakes.add(place, "certificates are for a port tls:// or listen://: this one has no TLS")
+    if listens and own.certificate is None:
+        mistakes.add(place, "the side that listens shows a certificate: write certificate and key")
+    if not listens and own.ca is None:
+        mistakes.add(place, "write the authority that signs the certificate there, as `ca`")
+    if own.writers and not (masters and own.mutual):
+        text = (
+            "roles are in the certificates of masters: they need `serve: true` and `mutual: true`"
+        )
+        mistakes.add((*place, "writers"), text)
+    if own.name and (masters or (listens and not own.mutual)):
+        text = "no certificate of the other side has to have one name: it needs `mutual: true`"
+        mistakes.add((*place, "name"), "masters have roles: `writers`" if masters else text)
 
 
 def check_connection(

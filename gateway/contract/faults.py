@@ -31,7 +31,8 @@ def faults(documents: Documents) -> Iterator[str]:
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
     yield from _of_parts(documents)
     for setting, document in below("certificates/", documents):
-        if wrong := certificate_fault(f"zenoh.tls.{setting}", document):
+        called = setting if "." in setting else f"zenoh.tls.{setting}"
+        if wrong := certificate_fault(called, document):
             yield wrong
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
@@ -67,7 +68,8 @@ def certificate_fault(setting: str, document: Document) -> str:
     if document["trouble"]:
         return f"{setting} {file}: {document['trouble']}"
     if days < 0:
-        return f"{setting} {file} expired {-days:.0f} days ago: Zenoh accepts no new connection"
+        what = "Zenoh accepts" if setting.startswith("zenoh") else "the other side accepts"
+        return f"{setting} {file} expired {-days:.0f} days ago: {what} no new connection"
     if days < DAYS_LEFT:
         return f"{setting} {file} expires in {days:.0f} days: renew it"
     return ""

@@ -19,6 +19,7 @@ class Why(StrEnum):
     NOT_ACCEPTED = "not-accepted"  # a write where the master may not write
     PART = "part-of-a-tag"  # a write of some words of a longer value
     BAD = "bad"  # the value is not known
+    ROLE = "role"  # a write by a master whose role may not write
 
 
 class Denied(Exception):
@@ -56,3 +57,18 @@ class Store(Protocol):
 
         `points`: bits that travel together. `missing`: the bits of a cell that the request lacks.
         """
+
+
+class ReadOnly:
+    """The data of a station for a master that may write nothing. A `Store`."""
+
+    def __init__(self, store: Store) -> None:
+        self.read, self.read_points = store.read, store.read_points
+
+    def write(
+        self,
+        _cells: Sequence[tuple[Cell, int]],
+        _points: Sequence[tuple[Cell, int]] = (),
+        _missing: Mapping[Cell, int] = NOTHING,
+    ) -> Written:
+        raise Denied(Why.ROLE)

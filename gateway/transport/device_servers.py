@@ -6,6 +6,7 @@ they are no bytes of the line.
 """
 
 import asyncio
+import socket
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -14,10 +15,16 @@ from weakref import WeakKeyDictionary
 import structlog
 
 from gateway.errors import LineDown
-from gateway.transport.os_errors import line_down
-from gateway.transport.port import LONGEST_REGISTRATION, DeviceServer, ListenAddress, Receiver
+from gateway.transport.listen import begin, listening
+from gateway.transport.port import (
+    LONGEST_REGISTRATION,
+    DeviceServer,
+    ListenAddress,
+    Receiver,
+    TlsConfig,
+)
 from gateway.transport.stream import Allowance, StreamPort
-from gateway.transport.tcp import configure
+from gateway.transport.tls import ServerFiles, names_of
 
 log = structlog.get_logger("gateway.line")
 
@@ -26,6 +33,7 @@ MOST_UNREGISTERED = 64  # connections; for one more the oldest of the busiest ad
 SILENT = 5.0  # seconds after which a second connection of a registration replaces the first
 UNUSED = 30.0  # seconds without a line until a door closes: a line that reopens needs it again
 _LOG_EVERY = 10.0  # seconds
+_WAITING = 100  # connections that the system accepts before this process does
 _SHOWN = 32  # bytes of a refused registration in the log
 
 
@@ -42,12 +50,15 @@ class _Nobody:
 class _Connection(StreamPort):
     """The connection of one device server; once it is registered, the port of a line."""
 
-    def __init__(self, door: "_Door") -> None:
+    def __init__(self, door: "_Door", address: str) -> None:
         super().__init__(door.name, _Nobody())
         self._door = door
-        self.address = ""
+        self.address = address
         self.greeting = b""  # the first bytes
         self.server: DeviceServer | None = None
+        self.names: set[str] = set()  # in its certificate
+        self.handshake: asyncio.Task[None] | None = None
+        self.ended = False
         self.heard_at = asyncio.get_running_loop().time()
         self.ready()
 
@@ -67,17 +78,27 @@ class _Connection(StreamPort):
 
     def end(self, why: str) -> None:
         """Closes the connection, and tells its line why."""
+        self.ended = True
+        if self.handshake is not None:
+            self.handshake.cancel()
         self._break(why)
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
+    def begin(self, connection: socket.socket, files: ServerFiles | None) -> None:
+        self.handshake = asyncio.create_task(self._begin(connection, files))
+
+    async def _begin(self, connection: socket.socket, files: ServerFiles | None) -> None:
         try:
-            configure(transport.get_extra_info("socket"))
-            self.address = str(transport.get_extra_info("peername")[0])
-        except (OSError, TypeError):  # it is gone already: it has no address
-            self.end("gone")
+            await begin(self, connection, files, REGISTERS_WITHIN)
+        except LineDown as error:
+            self.handshake = None
+            self._door.refuse(self, str(error).removeprefix(f"{self.name}: "))
+            self._door.lost(self)
             return
-        self._door.connected(self)
+        self.names, self.handshake = names_of(self), None
+        if self._door.has_named(self.names):
+            self._door.greeted(self)
+        else:
+            self._door.refuse(self, "its certificate has another name")
 
     def data_received(self, data: bytes) -> None:
         self.heard_at = asyncio.get_running_loop().time()
@@ -100,7 +121,9 @@ class _Door:
     """One port of this machine, and the device servers that are connected to it."""
 
     where: tuple[str, int]
-    _server: asyncio.Server | None = None
+    tls: TlsConfig | None = None
+    files: ServerFiles | None = None
+    _accepting: asyncio.Task[None] | None = None
     _opening: asyncio.Lock = field(default_factory=asyncio.Lock)
     _unregistered: dict[_Connection, asyncio.TimerHandle] = field(default_factory=dict)
     _known: dict[DeviceServer, asyncio.Event] = field(default_factory=dict)  # set: it is connected
@@ -118,9 +141,12 @@ class _Door:
     async def connection(self, server: DeviceServer, timeout: float) -> _Connection:
         """Returns its connection, or waits for it. Raises `LineDown`."""
         arrived = self._known.setdefault(server, asyncio.Event())
+        if self.files is not None:
+            await self.files.context()
         async with self._opening:
-            if self._server is None:
-                await self._open()
+            if self._accepting is None:
+                where = await listening(*self.where, _WAITING)
+                self._accepting = asyncio.create_task(self._accept(where))
         self.keep()
         for one in list(self._unregistered):
             self.greeted(one)
@@ -133,12 +159,19 @@ class _Door:
         who = f" as {_shown(server.registration)}" if server.registration else ""
         raise LineDown(f"{self.name}: no device server has connected{again}{who}")
 
-    async def _open(self) -> None:
-        create = asyncio.get_running_loop().create_server
-        try:
-            self._server = await create(lambda: _Connection(self), *self.where)
-        except (OSError, UnicodeError, OverflowError) as error:
-            raise line_down(self.name, error) from error
+    async def _accept(self, where: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        with where:  # closed when the loop no longer watches it
+            while True:
+                try:
+                    connection, address = await loop.sock_accept(where)
+                except OSError as error:  # too many open files
+                    log.warning("connection refused", port=self.name, why=str(error))
+                    await asyncio.sleep(_LOG_EVERY)
+                    continue
+                one = _Connection(self, address[0])
+                one.begin(connection, self.files)
+                self.connected(one)
 
     def keep(self) -> None:
         """Stays open for `UNUSED` seconds, and while a line has a connection."""
@@ -156,9 +189,9 @@ class _Door:
         """Closes the port and its connections. A line that needs it opens it again."""
         if self._end is not None:
             self._end.cancel()
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        if self._accepting is not None:
+            self._accepting.cancel()
+            self._accepting = None
         for one in [*self._unregistered, *self._connected.values(), *self._second.values()]:
             one.end("the port was closed")
 
@@ -167,27 +200,33 @@ class _Door:
     def connected(self, one: _Connection) -> None:
         if len(self._unregistered) >= MOST_UNREGISTERED:
             [(most, _)] = Counter(other.address for other in self._unregistered).most_common(1)
-            self._refuse(next(other for other in self._unregistered if other.address == most))
-        late = asyncio.get_running_loop().call_later(REGISTERS_WITHIN, self._refuse, one)
+            self.refuse(next(other for other in self._unregistered if other.address == most))
+        late = asyncio.get_running_loop().call_later(REGISTERS_WITHIN, self.refuse, one)
         self._unregistered[one] = late
-        self.greeted(one)
 
     def greeted(self, one: _Connection) -> None:
         """Registers a connection as soon as its first bytes say who it is.
 
         What follows the registration is older than any request.
         """
+        if one.handshake is not None or one not in self._unregistered:
+            return
         found = [
             server
             for server in self._known
-            if one.greeting.startswith(server.registration) and server.allows(one.address)
+            if one.greeting.startswith(server.registration)
+            and server.allows(one.address)
+            and server.is_named(one.names)
         ]
         if found:
             self._unregistered.pop(one).cancel()
             one.server = max(found, key=lambda server: len(server.registration))
             self._registered(one, one.server)
         elif len(one.greeting) == LONGEST_REGISTRATION:
-            self._refuse(one)  # whatever follows, it is a stranger
+            self.refuse(one)  # whatever follows, it is a stranger
+
+    def has_named(self, names: set[str]) -> bool:
+        return any(server.is_named(names) for server in self._known)
 
     def lost(self, one: _Connection) -> None:
         if (late := self._unregistered.pop(one, None)) is not None:
@@ -217,7 +256,7 @@ class _Door:
             return
         if first.heard_at > heard_at:
             del self._second[one.server]
-            self._refuse(one)
+            self.refuse(one)
         else:
             first.end("its device server has connected again")
 
@@ -228,15 +267,18 @@ class _Door:
         who = {"address": one.address, "registration": _shown(server.registration)}
         log.info("device server connected", port=self.name, **who)
 
-    def _refuse(self, one: _Connection) -> None:
+    def refuse(self, one: _Connection, why: str = "") -> None:
         if (late := self._unregistered.pop(one, None)) is not None:
             late.cancel()
+        if one.ended:  # its handshake ends now
+            return
+        sent = one.greeting
         if one.server is not None:
             why, sent = "another one with its registration still sends", one.server.registration
-        elif any(server.allows(one.address) for server in self._known):
-            why, sent = "no line has its registration", one.greeting
+        elif not any(server.allows(one.address) for server in self._known):
+            why = "no line allows its address"
         else:
-            why, sent = "no line allows its address", one.greeting
+            why = why or "no line has its registration"
         one.end(why)
         self._refused += 1
         now = asyncio.get_running_loop().time()
@@ -261,6 +303,8 @@ async def open_listen(
     doors = _doors.setdefault(asyncio.get_running_loop(), {})
     place = (where.host, where.port)
     door = doors.setdefault(place, _Door(place))
+    if door.tls != where.tls:
+        door.tls, door.files = where.tls, None if where.tls is None else ServerFiles(where.tls)
     port = await door.connection(where.server, timeout)
     port.serve(receiver, baudrate)
     return port

@@ -12,10 +12,13 @@ from gateway.transport.os_errors import line_down
 from gateway.transport.port import Port, Receiver, TcpAddress
 from gateway.transport.stream import StreamPort
 from gateway.transport.tcp import configure
+from gateway.transport.tls import ServerFiles, not_begun
 
 log = structlog.get_logger("gateway.line")
 MOST_CONNECTIONS = 32
 _BUSY = 10.0  # seconds since its last bytes for which a connection is not closed for another one
+_HANDSHAKE = 5.0  # seconds for TLS to begin
+_LOG_EVERY = 10.0  # seconds between two refused certificates in the log
 _WAITING = 8  # connections that the system accepts before this process does
 
 
@@ -34,19 +37,15 @@ class Listener:
         self._where = where
         self._socket: socket.socket | None = None
         self._ports: set[_Accepted] = set()
+        self._files = None if where.tls is None else ServerFiles(where.tls)
+        self._logged_at = 0.0
 
     async def open(self) -> None:
         """Raises `LineDown`."""
-        loop = asyncio.get_running_loop()
-        try:
-            found = await loop.getaddrinfo(
-                self._where.host, self._where.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-            )
-            family, _, _, _, address = found[0]
-            self._socket = socket.create_server(address[:2], family=family, backlog=_WAITING)
-            self._socket.setblocking(False)
-        except (OSError, UnicodeError, OverflowError) as error:
-            raise line_down(self._name, error) from error
+        self._logged_at = asyncio.get_running_loop().time() - _LOG_EVERY
+        if self._files is not None:
+            await self._files.context()
+        self._socket = await listening(self._where.host, self._where.port, _WAITING)
 
     async def serve(self, connect: Callable[[str], Connected | None]) -> None:
         """Accepts connections until cancelled. `connect` makes the receiver of each, from the
@@ -78,13 +77,20 @@ class Listener:
             log.warning("connection closed", port=self._name, why=f"{why}: the idlest goes")
             await idlest.close()
         accepted = _Accepted(self._name, receiver, self._ports)
+        accepted.handshake = loop.create_task(self._begin(accepted, connection))
+        if self._files is None:  # it begins at once
+            await accepted.handshake
+
+    async def _begin(self, accepted: "_Accepted", connection: socket.socket) -> None:
         try:
-            configure(connection)
-            await loop.connect_accepted_socket(lambda: accepted, connection)
-        except OSError as error:  # the master is gone already
-            log.debug("connection lost", port=self._name, why=str(error))
+            await begin(accepted, connection, self._files, _HANDSHAKE)
+        except LineDown as error:
+            now = asyncio.get_running_loop().time()
+            known = now - self._logged_at < _LOG_EVERY or self._files is None
+            (log.debug if known else log.warning)("connection refused", why=str(error))
+            self._logged_at = self._logged_at if known else now
             self._ports.discard(accepted)
-            connection.close()
+        accepted.handshake = None
 
     async def close(self) -> None:
         """Closes the port and its connections; never raises."""
@@ -102,13 +108,20 @@ class _Accepted(StreamPort):
     def __init__(self, name: str, receiver: Connected, ports: "set[_Accepted]") -> None:
         super().__init__(name, receiver)
         self._ports = ports
+        self._connected = receiver
+        self.handshake: asyncio.Task[None] | None = None
         self.opened_at = self.heard_at = asyncio.get_running_loop().time()
         ports.add(self)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
         self.ready()
-        receiver.opened(self)
+        self._connected.opened(self)
 
     async def close(self) -> None:
         self._ports.discard(self)
+        if self.handshake is not None:
+            self.handshake.cancel()
         await super().close()
 
     def data_received(self, data: bytes) -> None:
@@ -118,3 +131,40 @@ class _Accepted(StreamPort):
     def connection_lost(self, exc: Exception | None) -> None:
         self._ports.discard(self)
         super().connection_lost(exc)
+
+
+async def listening(host: str, port: int, backlog: int) -> socket.socket:
+    """Returns a socket that listens. Raises `LineDown`."""
+    loop = asyncio.get_running_loop()
+    try:
+        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = found[0]
+        made = socket.create_server(address[:2], family=family, backlog=backlog)
+    except (OSError, UnicodeError, OverflowError) as error:
+        raise line_down(f"{host}:{port}", error) from error
+    made.setblocking(False)
+    return made
+
+
+async def begin(
+    port: StreamPort, connection: socket.socket, files: ServerFiles | None, within: float
+) -> None:
+    """Begins an accepted connection, with TLS if there are files. Raises `LineDown`, and then it is
+    closed. `port` gets its transport when the other side has shown its certificate."""
+    begun, loop = False, asyncio.get_running_loop()
+    try:
+        configure(connection)
+        context = None if files is None else await files.context()
+        async with asyncio.timeout(within):
+            await loop.connect_accepted_socket(
+                lambda: port,
+                connection,
+                ssl=context,
+                ssl_handshake_timeout=None if context is None else within + 1.0,
+            )
+        begun = True
+    except OSError as error:
+        raise not_begun(port.name, error) from error
+    finally:
+        if not begun:
+            connection.close()

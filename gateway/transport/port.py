@@ -1,8 +1,10 @@
 """The port contract, and port addresses as the configuration file writes them."""
 
 import re
+from collections.abc import Container
 from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_address
+from pathlib import Path
 from typing import Protocol
 
 from gateway.errors import ConfigError
@@ -38,12 +40,34 @@ class SerialPath:
     path: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TlsConfig:
+    """Certificates (PEM files). `mutual`: both sides show one."""
+
+    ca: Path | None = None  # certificate authority to trust
+    certificate: Path | None = None
+    key: Path | None = None
+    mutual: bool = False
+    revoked: Path | None = None  # the list of certificates that the authority has revoked
+    name: str = ""  # of the other side, in its certificate; empty: its host
+    writers: tuple[str, ...] = ()  # the roles of masters that may write; empty: all may
+
+    def check(self) -> None:
+        """Raises `ConfigError` for settings that do not go together."""
+        if (self.certificate is None) is not (self.key is None):
+            raise ConfigError("certificate and key belong together")
+        if self.mutual and (self.ca is None or self.certificate is None):
+            raise ConfigError("mutual needs ca, certificate and key")
+
+
 @dataclass(frozen=True, slots=True)
 class TcpAddress:
-    """A device server in raw mode, or a device with a network port: `tcp://host:port`."""
+    """A device server in raw mode, or a device with a network port: `tcp://host:port`, and
+    `tls://host:port` with certificates."""
 
     host: str
     port: int
+    tls: TlsConfig | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +106,7 @@ class DeviceServer:
     registration: bytes = b""
     heartbeat: bytes = b""
     networks: Networks = ()
+    name: str = ""  # in its certificate; empty: any of the authority
 
     @property
     def words(self) -> tuple[bytes, ...]:
@@ -91,6 +116,10 @@ class DeviceServer:
     def allows(self, address: str) -> bool:
         return allows(self.networks, address)
 
+    def is_named(self, names: Container[str]) -> bool:
+        """`names`: in a certificate, in lower case."""
+        return not self.name or self.name.lower() in names
+
 
 @dataclass(frozen=True, slots=True)
 class ListenAddress:
@@ -99,6 +128,7 @@ class ListenAddress:
     host: str
     port: int
     server: DeviceServer = DeviceServer()
+    tls: TlsConfig | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +159,7 @@ class SerialSettings:
 
 LONGEST_REGISTRATION = 256  # bytes
 MODEM = "modem:"
-_URL = re.compile(r"(tcp|rfc2217|listen)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
+_URL = re.compile(r"(tcp|tls|rfc2217|listen)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
@@ -148,11 +178,13 @@ def parse_port(text: str) -> PortAddress:
             raise ConfigError(f"port number {port} is not 1..65535")
         if scheme == "listen":
             return ListenAddress(host, port)
-        return TcpAddress(host, port) if scheme == "tcp" else Rfc2217Address(host, port)
+        if scheme == "rfc2217":
+            return Rfc2217Address(host, port)
+        return TcpAddress(host, port, TlsConfig() if scheme == "tls" else None)
     if _SCHEME.match(text) or not text.strip() or text != text.strip():
         raise ConfigError(
             f"{text!r} is not a port: write a path such as /dev/ttyUSB0, "
-            "tcp://host:port, rfc2217://host:port, listen://host:port, modem:/dev/ttyS0, or "
-            "simulator"
+            "tcp://host:port, tls://host:port, rfc2217://host:port, listen://host:port, "
+            "modem:/dev/ttyS0, or simulator"
         )
     return SerialPath(text)

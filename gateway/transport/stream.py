@@ -77,7 +77,7 @@ class StreamPort(asyncio.Protocol):
 
     @property
     def transport(self) -> asyncio.Transport | None:
-        """The transport, for the signals of a serial port."""
+        """The transport, for the signals of a serial port, and the certificate of the peer."""
         return self._transport
 
     def descriptor(self) -> int:
@@ -115,6 +115,10 @@ class StreamPort(asyncio.Protocol):
     # Called by asyncio.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.use(transport)
+
+    def use(self, transport: asyncio.BaseTransport) -> None:
+        """Sends and receives by this transport from now on: once more where TLS has begun."""
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=MOST_UNSENT)
         if hasattr(transport, "max_size"):  # uvloop has its own

@@ -7,6 +7,7 @@ from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
 from gateway.transport.port import Receiver, TcpAddress
 from gateway.transport.stream import StreamPort
+from gateway.transport.tls import begin_tls, make_context
 
 # A peer without power sends nothing. After 20 s of silence the system sends a keep-alive three
 # times, every 10 s. Sent data must be acknowledged within 50 s, or the line is down. The names
@@ -27,14 +28,17 @@ async def open_tcp(
 
     `baudrate`: of the wire behind it; 0: not known.
     """
-    name = f"{where.host}:{where.port}"
-    port = StreamPort(name, receiver, baudrate)
+    name, loop = f"{where.host}:{where.port}", asyncio.get_running_loop()
+    port, by = StreamPort(name, receiver, baudrate), loop.time() + timeout
+    tls, context = where.tls, None
     try:
-        async with asyncio.timeout(timeout):
-            transport, _ = await asyncio.get_running_loop().create_connection(
-                lambda: port, where.host, where.port
-            )
+        async with asyncio.timeout_at(by):
+            if tls is not None:
+                context = await asyncio.to_thread(make_context, tls, serves=False)
+            transport, _ = await loop.create_connection(lambda: port, where.host, where.port)
         configure(transport.get_extra_info("socket"))
+        if tls is not None and context is not None:
+            await begin_tls(port, context, within=by - loop.time(), host=tls.name or where.host)
         port.ready()
     # UnicodeError: an invalid host name, for example with an empty label.
     except (OSError, UnicodeError, LineDown) as error:

@@ -18,7 +18,15 @@ from gateway.contract.access.certificates import expires
 from gateway.contract.faults import faults
 from gateway.errors import ConfigError
 from tests.conftest import needs
-from tests.e2e.processes import ROOT, plc_gateway, started, until, vigor_line, write_config
+from tests.e2e.processes import (
+    ROOT,
+    free_port,
+    plc_gateway,
+    started,
+    until,
+    vigor_line,
+    write_config,
+)
 from tests.zenoh_peer import free_endpoint
 
 
@@ -80,10 +88,12 @@ def _plant(folder: Path, days: int) -> tuple[Path, Path]:
     _renew(pki, days)
     endpoint = free_endpoint().replace("tcp/", "tls/")
     tls = {"ca": "pki/ca.pem", "certificate": "pki/gateway.pem", "key": "pki/gateway.key"}
+    device = {"protocol": "modbus-tcp", "tags": {"level": {"address": "holding:7"}}}
+    boiler = {"port": f"tls://127.0.0.1:{free_port()}", "tls": tls, "devices": {"boiler": device}}
     file = write_config(
         folder / "c.yaml",
         endpoint,
-        {"hall": vigor_line("simulator", {"speed": {"address": "D1"}})},
+        {"hall": vigor_line("simulator", {"speed": {"address": "D1"}}), "boiler": boiler},
         zenoh={"prefix": "plant", "listen": [endpoint], "tls": tls},
     )
     return file, pki
@@ -108,9 +118,10 @@ def test_a_certificate_says_how_long_it_is_valid_and_is_renewed(tmp_path: Path) 
         os.kill(program.pid, signal.SIGHUP)
         program.says("gateway outdated", "the files of zenoh.tls were renewed")
         program.says("gateway starts over")
-        until(lambda: plc_gateway("health", "--strict", file).code == 0, "nothing is wrong")
-        found = json.loads(plc_gateway("status", "--json", file).out)["certificates/certificate"]
-        assert 199 < found["days"] <= 200
+        until(lambda: said not in plc_gateway("health", "--strict", file).err, "it is renewed")
+        found = json.loads(plc_gateway("status", "--json", file).out)
+        for setting in ("certificate", "lines.boiler.tls.certificate"):
+            assert 199 < found[f"certificates/{setting}"]["days"] <= 200
 
 
 def test_files_that_do_not_fit_each_other_are_not_taken_over(tmp_path: Path) -> None:
@@ -130,6 +141,8 @@ def test_an_expired_certificate_is_a_fault() -> None:
     lost = {"file": "hall.pem", "expires": None, "days": None, "trouble": "Permission denied"}
     said = "zenoh.tls.ca hall.pem: Permission denied"
     assert list(faults({"certificates/ca": lost})) == [said]
+    said = "lines.b.tls.ca hall.pem expired 3 days ago: the other side accepts no new connection"
+    assert list(faults({"certificates/lines.b.tls.ca": expired})) == [said]
 
 
 @given(st.binary(max_size=400))

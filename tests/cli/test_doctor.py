@@ -8,7 +8,9 @@ from typing import Any
 
 from tests.cli.conftest import Command
 from tests.e2e.processes import free_port, plc_gateway, vigor_line, write_config
+from tests.transport.authority import DAY, Authority
 from tests.transport.ends import PtyMaster
+from tests.transport.test_tls import foreign_server, serving
 from tests.zenoh_peer import free_endpoint
 
 TAGS = {"speed": {"address": "D10", "history": True}}
@@ -56,6 +58,17 @@ def test_each_port_has_its_state_and_its_remedy(command: Command, tmp_path: Path
     state, says, mend = rows["gateway demo"]
     assert (state, mend.partition(" /")[0]) == ("look", "plc-gateway run")
     assert "no gateway at" in says
+
+
+def test_a_certificate_that_is_refused_is_said(command: Command, tmp_path: Path) -> None:
+    plant_of_it = Authority(tmp_path / "pki")
+    late = foreign_server(*plant_of_it.issue("late", left=-DAY))
+    with serving(late) as number:
+        line = on_line("d1", f"tls://127.0.0.1:{number}") | {"tls": {"ca": "pki/ca.pem"}}
+        code, rows = found(command, plant(tmp_path, {"hall": line}, history={}))
+    state, says, _ = rows[f"line hall, 127.0.0.1:{number}"]
+    assert (code, state) == (1, "bad")
+    assert says == "its certificate has expired: renew it there, or correct the clock here"
 
 
 def test_a_serial_port_that_another_program_has_open_is_said(

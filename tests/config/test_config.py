@@ -333,14 +333,14 @@ LINES = [
             "parity: even\ndevices: {mixer: {protocol: vigor}}"
         ),
         "3: lines.hall.port: 'udp://10.0.0.7:4001' is not a port: write a path such as "
-        "/dev/ttyUSB0, tcp://host:port, rfc2217://host:port, listen://host:port, "
+        "/dev/ttyUSB0, tcp://host:port, tls://host:port, rfc2217://host:port, listen://host:port, "
         "modem:/dev/ttyS0, or simulator",
         "4: lines.hall.baudrate: 1920 is no baud rate of serial ports; the nearest is 2400",
         "5: lines.hall.format: '7X1' is no character format: write data bits (7 or 8), parity "
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, origin, echo, rs485, device_server, serve, request_gap, "
+        "use port, baudrate, format, origin, echo, rs485, device_server, tls, serve, request_gap, "
         "listen_only, modem, connect_delay, close_after, defaults or devices",
     ),
     bad(

@@ -11,7 +11,12 @@ from pydantic import Field
 
 from gateway.config.settings import parsers
 from gateway.config.settings.modem_settings import ModemSection
-from gateway.config.settings.session_model import GatewaySection, Section, ZenohSection
+from gateway.config.settings.session_model import (
+    GatewaySection,
+    Section,
+    TlsSection,
+    ZenohSection,
+)
 from gateway.config.settings.setting_types import (
     FORMAT_SCHEMA,
     IDENTITY_SCHEMA,
@@ -26,6 +31,7 @@ from gateway.config.settings.setting_types import (
     Text,
 )
 from gateway.tags.tag import NotReal
+from gateway.transport.port import TlsConfig
 
 
 class WritersSection(Section):
@@ -95,12 +101,26 @@ class DeviceServerSection(Section):
     """The addresses that may connect, such as [10.1.0.0/16]; left out: all."""
 
 
+class LineTlsSection(TlsSection):
+    """TLS of a port `tls://host:port` or `listen://host:port`: docs/connections.md."""
+
+    revoked: FilePath | None = None
+    """The list of the certificates that the authority has revoked, a PEM file."""
+    name: Text = ""
+    """The name in the certificate of the other side; left out: the host of the port."""
+    writers: list[Text] = []
+    """With serve: the roles of masters that may write; left out: all masters."""
+
+    def record(self) -> TlsConfig:
+        return TlsConfig(**dict(self) | {"writers": tuple(self.writers)})
+
+
 class LineSection(Section):
     """One line and the devices on it."""
 
     port: Port
-    """A serial port, tcp://host:port, rfc2217://host:port, listen://host:port, modem:<port>, or
-    simulator."""
+    """A serial port, tcp://host:port, tls://host:port, rfc2217://host:port, listen://host:port,
+    modem:<port>, or simulator."""
     baudrate: Baudrate = None
     """Speed of the line, also behind a device server; left out: the default of the protocol."""
     format: Annotated[str | None, Parsed(parsers.serial_format, FORMAT_SCHEMA)] = None
@@ -113,6 +133,8 @@ class LineSection(Section):
     """Has Linux switch the RS-485 transceiver of a serial port; left out: it switches by itself."""
     device_server: DeviceServerSection | None = None
     """Of a port `listen://…`: which device server this line waits for."""
+    tls: LineTlsSection | None = None
+    """Of a port `tls://…` or `listen://…`: its certificates."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
     request_gap: Duration | None = None

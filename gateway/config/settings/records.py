@@ -14,7 +14,14 @@ from gateway.tags import Tag
 from gateway.tags.tag import NotReal
 from gateway.tags.transfer import TransferRule
 from gateway.transport.modem_events import ModemSettings
-from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
+from gateway.transport.port import (
+    ListenAddress,
+    PortAddress,
+    SerialSettings,
+    SimulatorAddress,
+    TcpAddress,
+    TlsConfig,
+)
 
 P = TypeVar("P")
 
@@ -73,6 +80,15 @@ class Config:
     @cached_property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
+
+    @property
+    def secured(self) -> Mapping[str, TlsConfig]:
+        """The certificates of Zenoh and of the lines, by setting."""
+        ports = {f"lines.{line.name}.tls": line.port for line in self.lines}
+        kinds = (TcpAddress, ListenAddress)
+        found = {name: one.tls for name, one in ports.items() if isinstance(one, kinds)}
+        found = {"zenoh.tls": self.zenoh.tls, **found}
+        return {name: tls for name, tls in found.items() if tls is not None}
 
     @property
     def dialling(self) -> Mapping[str, float]:

@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 from gateway.config.messages import Mistakes, Path
 from gateway.errors import ConfigError
 from gateway.files import is_file
+from gateway.transport.port import TlsConfig as TlsConfig
 
 NAME = "gateway"  # of a gateway without one in the file
 LISTEN = ("tcp/127.0.0.1:7447",)  # where the file says nothing
@@ -16,23 +17,6 @@ class ZenohMode(StrEnum):
     PEER = "peer"
     CLIENT = "client"
     ROUTER = "router"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TlsConfig:
-    """Certificates (PEM files). `mutual`: both sides show one."""
-
-    ca: FilePath | None = None  # certificate authority to trust
-    certificate: FilePath | None = None
-    key: FilePath | None = None
-    mutual: bool = False
-
-    def check(self) -> None:
-        """Raises `ConfigError` for settings that do not go together."""
-        if (self.certificate is None) is not (self.key is None):
-            raise ConfigError("certificate and key belong together")
-        if self.mutual and (self.ca is None or self.certificate is None):
-            raise ConfigError("mutual needs ca, certificate and key")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,19 +51,27 @@ def with_files(found: ZenohConfig, folder: FilePath, mistakes: Mistakes) -> Zeno
         return existing_file(name, folder, ("zenoh", *place), mistakes)
 
     tls = found.tls
-    if tls is not None:
-        tls = replace(
-            tls,
-            ca=file(tls.ca, "tls", "ca"),
-            certificate=file(tls.certificate, "tls", "certificate"),
-            key=file(tls.key, "tls", "key"),
-        )
     return replace(
         found,
         config_file=file(found.config_file, "config_file"),
-        tls=tls,
+        tls=None if tls is None else tls_files(tls, folder, ("zenoh", "tls"), mistakes),
         password_file=file(found.password_file, "password_file"),
         users_file=file(found.users_file, "users_file"),
+    )
+
+
+def tls_files(found: TlsConfig, folder: FilePath, path: Path, mistakes: Mistakes) -> TlsConfig:
+    """Returns the certificates with their paths below `folder`; notes files that are not there."""
+
+    def file(name: str) -> FilePath | None:
+        return existing_file(getattr(found, name), folder, (*path, name), mistakes)
+
+    return replace(
+        found,
+        ca=file("ca"),
+        certificate=file("certificate"),
+        key=file("key"),
+        revoked=file("revoked"),
     )
 
 

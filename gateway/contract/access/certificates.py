@@ -8,14 +8,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from gateway import files
-from gateway.config import TlsConfig
+from gateway.config import Config, TlsConfig
+from gateway.contract.access.secrets import closed_to_others
 from gateway.contract.documents.state import CertificateDocument
 from gateway.contract.faults import certificate_fault
 from gateway.errors import ConfigError
 from gateway.tags.timestamps import rfc3339
 
 DAY = 86_400
-_UTC_TIME, _VERSION = 0x17, 0xA0  # tags of ASN.1
+_UTC_TIME, _VERSION, _EXTENSIONS, _UTF8 = 0x17, 0xA0, 0xA3, 0x0C  # tags of ASN.1
+# 1.3.6.1.4.1.50316.802.1, the extension of Modbus/TCP Security (V3.6, 8.2).
+_ROLE = bytes.fromhex("2b060104018389 0c862201")
 
 
 def check_files(tls: TlsConfig, section: str = "zenoh.tls") -> ssl.SSLContext:
@@ -25,7 +28,8 @@ def check_files(tls: TlsConfig, section: str = "zenoh.tls") -> ssl.SSLContext:
     certificate.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
+    found = (("ca", tls.ca), ("certificate", tls.certificate), ("revoked", tls.revoked))
+    for name, file in found:
         if file is not None:
             with _as_config_error(f"{section}.{name} {file}", "holds no certificate in PEM form"):
                 context.load_verify_locations(file)
@@ -36,14 +40,20 @@ def check_files(tls: TlsConfig, section: str = "zenoh.tls") -> ssl.SSLContext:
     return context
 
 
-def expiries(tls: TlsConfig) -> list[str]:
-    """Returns a sentence for each file of `zenoh.tls` that expires within 30 days."""
+def check(config: Config) -> list[str]:
+    """Returns a sentence for each certificate of Zenoh and of lines that expires within 30 days.
+
+    Raises `ConfigError` for files that are no certificate or key, or do not belong together.
+    """
     found = []
-    for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
-        if file is not None:
-            with _as_config_error(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
+    for section, tls in config.secured.items():
+        if tls.key is not None:
+            closed_to_others(tls.key, f"{section}.key")
+        check_files(tls, section)
+        for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
+            if file is not None:
                 at = expires(files.read(file, files.MOST_OF_SECRETS), last=name == "ca")
-            found += [certificate_fault(f"zenoh.tls.{name}", document(file, at, time.time()))]
+                found += [certificate_fault(f"{section}.{name}", document(file, at, time.time()))]
     return [one for one in found if one]
 
 
@@ -75,6 +85,32 @@ def expires(content: bytes, *, last: bool = False) -> float:
     if not found:
         raise ConfigError("it holds no certificate in PEM form")
     return max(found) if last else min(found)
+
+
+def role(der: bytes) -> str:
+    """Returns the role of Modbus/TCP Security in a certificate; empty: it has none.
+
+    Only that of the extension counts: a name may hold the same bytes.
+    """
+    try:
+        _, certificate = _element(der)
+        _, fields = _element(certificate)
+        while fields[0] != _EXTENSIONS:
+            fields = _after(fields)
+        _, listed = _element(fields)
+        _, rest = _element(listed)
+        while rest:
+            _, extension = _element(rest)
+            rest = _after(rest)
+            if _element(extension)[1] != _ROLE:
+                continue
+            while more := _after(extension):  # a flag may stand before the value
+                extension = more
+            tag, text = _element(_element(extension)[1])
+            return text.decode() if tag == _UTF8 else ""
+    except (IndexError, UnicodeDecodeError):
+        pass
+    return ""
 
 
 def _not_after(der: bytes) -> float:

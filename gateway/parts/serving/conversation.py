@@ -19,6 +19,7 @@ class Conversation:
         self.trouble = ""
         self._line = line
         self._network = network
+        self._may_write = True
         self._machine = line.machine()
         self._port: Port | None = None
         self._reply: asyncio.TimerHandle | None = None
@@ -27,6 +28,8 @@ class Conversation:
 
     def opened(self, port: Port) -> None:
         self._port = port
+        self._may_write = self._line.may_write(port)
+        self._machine = self._line.machine(may_write=self._may_write)
 
     def received(self, data: bytes) -> None:
         line, now = self._line, asyncio.get_running_loop().time()
@@ -54,7 +57,7 @@ class Conversation:
     def _begin_again(self) -> None:
         """Drops what was received. A connection is closed: its next frame begins anywhere."""
         self._cancel()
-        self._machine = self._line.machine()
+        self._machine = self._line.machine(may_write=self._may_write)
         if self._network and self._port is not None:
             self._closing = asyncio.create_task(self._port.close())
             self._port = None

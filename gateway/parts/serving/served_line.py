@@ -24,15 +24,19 @@ from gateway.stations.served.echo import Echo
 from gateway.stations.served.registers import Registers, Served, ServedTag
 from gateway.stations.served.registry import answerer
 from gateway.stations.served.station import Presence, ServedStation
+from gateway.stations.store import ReadOnly
 from gateway.tags import Sample
 from gateway.transport import (
     ModemAddress,
+    Port,
     TcpAddress,
     open_modem,
     open_port,
     prepare,
 )
 from gateway.transport.listen import Listener
+from gateway.transport.stream import StreamPort
+from gateway.transport.tls import certificate_of
 
 log = structlog.get_logger("gateway.line")
 NEVER = float("inf")
@@ -188,13 +192,25 @@ class ServedLine:
 
     # The conversations
 
-    def machine(self) -> Answerer:
+    def may_write(self, port: Port) -> bool:
+        """Returns False for a master whose certificate has no role that may write."""
+        where = self.config.port
+        writers = where.tls.writers if isinstance(where, TcpAddress) and where.tls else ()
+        if not writers:
+            return True
+        from gateway.contract.access.certificates import role  # its TLS takes 10 ms
+
+        return isinstance(port, StreamPort) and role(certificate_of(port)) in writers
+
+    def machine(self, *, may_write: bool = True) -> Answerer:
         """Returns a new answering machine for the stations."""
         devices = [one for one in self.config.devices if one.enabled]
         timing, wire = devices[0].timing, self.config.wire
         usual = wire.silence(timing) if timing.silence_chars else 0.0
         stations = {
-            number: Answering(station.driver, station.registers)
+            number: Answering(
+                station.driver, station.registers if may_write else ReadOnly(station.registers)
+            )
             for number, station in self.stations.items()
         }
         made = Wire(

@@ -20,6 +20,7 @@ from gateway.stations.store import Cell, Denied, Rejected, Store, Why, Written
 
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE, _FAILURE = "01", "02", "03", "04"
 MOST: Mapping[int, int] = {1: 2000, 2: 2000, 3: 125, 4: 125, 15: 1968, 16: 123}
+_CODES = {Why.BAD: _FAILURE, Why.ROLE: _ILLEGAL_FUNCTION}  # Modbus/TCP Security: 01 for a role
 _WRITES = (*WRITE_SINGLE, *WRITE_MANY)
 
 
@@ -56,7 +57,7 @@ class ModbusData:
         except Rejected as rejected:
             code = rejected.code
         except Denied as denied:
-            code = _FAILURE if denied.why is Why.BAD else _ILLEGAL_ADDRESS
+            code = _CODES.get(denied.why, _ILLEGAL_ADDRESS)
         return Answer(bytes((function | EXCEPTION, int(code, 16))), code)
 
     def _serve(self, function: int, pdu: bytes) -> tuple[bytes, str, Written]:
