@@ -11,6 +11,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from gateway.cli import completion
 from gateway.cli.client import Client, reached, suggestion
 from gateway.cli.repeated import repeated
 from gateway.cli.terminal import (
@@ -32,7 +33,7 @@ _MISTAKES = ("bad-value", "unknown-tag")
 
 
 def _alarm(option: str, text: str) -> Any:
-    return typer.Option(option, metavar="ALARM", help=text)
+    return typer.Option(option, metavar="ALARM", help=text, autocompletion=completion.alarms)
 
 
 def alarms(

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli import completion
 from gateway.cli.client import connected
 from gateway.cli.terminal import ConfigPath, Direct, end, err, printable
 from gateway.cli.write import error_code, outcome
@@ -13,7 +14,7 @@ from gateway.config.commands import check_command, line_of
 
 def control(
     config: ConfigPath,
-    device: Annotated[str, typer.Argument(metavar="DEVICE")],
+    device: Annotated[str, typer.Argument(metavar="DEVICE", autocompletion=completion.devices)],
     command: Annotated[str, typer.Argument(metavar="COMMAND", help="run, stop, model ...")],
     argument: Annotated[str, typer.Argument(metavar="[ARGUMENT]", help="text; on, off")] = "",
     without_gateway: Direct = False,

@@ -9,12 +9,13 @@ import sys
 from collections import UserDict
 from contextlib import suppress
 from importlib import import_module
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, cast
 
 import typer
 from typer.core import TyperGroup
 
 from gateway import __version__, config
+from gateway.cli.examples import epilog
 from gateway.cli.terminal import FAILED, USER_MISTAKE, end
 from gateway.errors import BadValue, ConfigError, GatewayError
 from gateway.parts import registry
@@ -74,9 +75,12 @@ def _imported(name: str, place: str) -> Any:
     alone = typer.Typer(**_FORM)
     if isinstance(found, typer.Typer):
         alone.add_typer(found, name=name)
-        return typer.main.get_group(alone).commands[name]
+        group = typer.main.get_group(alone).commands[name]
+        for below, command in cast("TyperGroup", group).commands.items():
+            command.epilog = epilog(f"{name} {below}")
+        return group
     settings = {"ignore_unknown_options": True} if name in _MINUS_IS_NO_OPTION else None
-    alone.command(name, context_settings=settings)(found)
+    alone.command(name, context_settings=settings, epilog=epilog(name))(found)
     return typer.main.get_command(alone)
 
 
@@ -92,7 +96,7 @@ cli = typer.Typer(
     cls=_Commands,
     name="plc-gateway",
     help="PLCs on serial lines <-> Eclipse Zenoh: polls, mirrors, writes back.",
-    **_FORM,
+    **{**_FORM, "add_completion": True},
 )
 
 _OUTPUT_FAILED = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # a full disk, a terminal that has gone

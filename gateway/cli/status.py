@@ -62,27 +62,30 @@ def health(
             "history not written.",
         ),
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Print the status of the running gateway. Exit code 0 if it replies (for containers)."""
+    """Print one sentence about the running gateway. Exit code 0 if it replies (for containers)."""
     with reached(config, err.print) as client:
-        if not strict:
-            print(json.dumps(client.status()))
-            return
-        documents = client.documents()
-        print(json.dumps(documents["status"]))
-        found = list(faults(documents))
+        documents: Documents = client.documents() if strict else {"status": client.status()}
+        sentence = f"{_title(documents)}: it answers"
+        print(json.dumps(documents["status"]) if as_json else printable(sentence))
+        found = list(faults(documents)) if strict else []
         for sentence in found:
             err.print(printable(sentence))
         if found:
             sys.exit(FAILED)
 
 
+def _title(documents: Documents) -> str:
+    gateway = documents["status"]
+    return f"{gateway['name']} {gateway['version']}, up {span(gateway['up'])}"
+
+
 def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> RenderableType:
     """Returns the whole status. `outcomes` of the last hour; None without history."""
     gateway = documents["status"]
-    title = f"{gateway['name']} {gateway['version']}, up {span(gateway['up'])}"
     parts: list[RenderableType] = [
-        Text(printable(f"{title}, {gateway['tags']} tags{_standby(documents)}")),
+        Text(printable(f"{_title(documents)}, {gateway['tags']} tags{_standby(documents)}")),
         Text(),
         _lines(documents),
         Text(),

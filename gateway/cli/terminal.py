@@ -7,6 +7,8 @@ from typing import Annotated, NoReturn
 import typer
 from rich.console import Console
 
+from gateway.cli import completion
+
 USER_MISTAKE, FAILED = 2, 1
 # Values of tags may hold brackets and colons: no markup.
 out = Console(
@@ -17,7 +19,11 @@ err = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The YAML file.")]
 TagNames = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[TAG]...", help="device/tag; wildcards as in Zenoh: 'mixer/**'"),
+    typer.Argument(
+        metavar="[TAG]...",
+        help="device/tag; wildcards as in Zenoh: 'mixer/**'",
+        autocompletion=completion.tags,
+    ),
 ]
 Direct = Annotated[
     bool,

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Self
 import typer
 
 from gateway import files
+from gateway.cli import completion
 from gateway.cli.client import connected
 from gateway.cli.line.capture import Capture
 from gateway.cli.terminal import AsJson, ConfigPath, err, printable
@@ -21,7 +22,9 @@ from gateway.config.settings import parsers
 from gateway.errors import ConfigError, GatewayError
 from gateway.parts.recording.wire_file import event_lines
 
-LineName = Annotated[str, typer.Argument(metavar="LINE", help="A line of the file.")]
+LineName = Annotated[
+    str, typer.Argument(metavar="LINE", help="A line of the file.", autocompletion=completion.lines)
+]
 _WIDTH = 40  # characters of the request
 
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import orjson
 import typer
 
+from gateway.cli import completion
 from gateway.cli.client import connected, parse_value, suggestion, tags_by_key
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
@@ -26,7 +27,14 @@ _USER_MISTAKES = {Problem.BAD_VALUE, Problem.NOT_WRITABLE, Problem.UNKNOWN_TAG}
 
 def write(
     config: ConfigPath,
-    tag: Annotated[str, typer.Argument(metavar="TAG", help="device/tag; a device for several")],
+    tag: Annotated[
+        str,
+        typer.Argument(
+            metavar="TAG",
+            help="device/tag; a device for several",
+            autocompletion=completion.tags,
+        ),
+    ],
     values: Annotated[
         list[str],
         typer.Argument(

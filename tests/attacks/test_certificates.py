@@ -77,7 +77,7 @@ def test_gateway_and_clients_know_each_other_by_their_certificates(tmp_path: Pat
             greets(port, other, "gateway.plant", refused=True)
         # A session of Zenoh with the certificate of the client.
         file.write_text(file.read_text().replace("plant/gateway.", "plant/scada."))
-        health = plc_gateway("health", file)
+        health = plc_gateway("health", "--json", file)
         assert json.loads(health.out)["name"] == "demo"
 
 

@@ -1,13 +1,19 @@
 """The commands as a whole: help, usage, version, exit codes. People see no traceback."""
 
 import json
+import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from gateway import __version__
+from gateway.cli.examples import EXAMPLES
+from gateway.cli.main import cli
 from gateway.config import schema as config_schema
 from tests.cli.conftest import Command
 from tests.e2e.processes import Done, plc_gateway
@@ -32,6 +38,52 @@ def test_every_command_helps(command: Command, name: str) -> None:
     assert done.code == 0
     assert f"plc-gateway {name}" in done.out
     assert "--help" in done.out
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_of_the_help_are_commands(name: str) -> None:
+    command: Any = typer.main.get_command(cli)
+    for part in name.split():
+        command = command.commands[part]
+    assert f"plc-gateway {name}" in str(command.epilog)
+    for text in EXAMPLES[name]:
+        with command.make_context(name, shlex.split(text)):
+            pass
+
+
+def test_every_command_has_examples() -> None:
+    group: Any = typer.main.get_command(cli)
+    found = {name for name in group.commands if name != "history"}
+    assert {name for name in EXAMPLES if " " not in name} == found
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("read FILE mixer/speed", ["mixer/speed"]),
+        ("watch FILE --json mixer/sp", ["mixer/speed"]),
+        ("control FILE mi", ["mixer"]),
+        ("trace FILE hall-1", ["hall-1"]),
+        ("alarms FILE --ack line:hall-1", ["line:hall-1"]),
+        ("read nothing.yaml mixer/s", []),
+    ],
+)
+def test_the_shell_completes_names_of_the_file(words: str, found: list[str]) -> None:
+    line = f"plc-gateway {words}".replace("FILE", EXAMPLE)
+    variables = {
+        "_PLC_GATEWAY_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
+    }
+    program = "import sys; sys.argv = ['plc-gateway']; from gateway.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == found
 
 
 @pytest.mark.parametrize(
@@ -141,6 +193,7 @@ def test_a_mistake_elsewhere_in_the_file_does_not_hide_the_running_gateway(
 
 
 def test_health_prints_the_status(running: Path) -> None:
-    done = plc_gateway("health", running)
+    assert plc_gateway("health", running).out.endswith(": it answers\n")
+    done = plc_gateway("health", "--json", running)
     assert done.code == 0
     assert json.loads(done.out)["devices"] == {"mixer": "up"}

@@ -72,7 +72,7 @@ def test_what_is_wrong_is_said_and_fails(tmp_path: Path) -> None:
         assert re.search(r"pump is silent: .*power", done.out)
         assert "oven" not in done.out[done.out.index("wrong:") :]  # its line says why
         assert re.search(r"^writes +1 written in the last hour", done.out, re.MULTILINE)
-        strict = plc_gateway("health", "--strict", config)
+        strict = plc_gateway("health", "--strict", "--json", config)
         assert strict.code == 1
         assert json.loads(strict.out)["devices"]["mixer"] == "up"
         assert strict.err.splitlines()[0].startswith("line yard is down:")

@@ -121,7 +121,7 @@ def test_the_command_line_has_the_rights_of_its_user(
         assert (done.code, done.out) == (1, "")
         assert "nothing was sent; may viewer do this, and does the gateway run" in done.err
         # Enough for a container, and no more.
-        assert json.loads(typed("health", "health", path).out)["name"] == "demo"
+        assert json.loads(typed("health", "health", path, "--json").out)["name"] == "demo"
         done = typed("health", "read", path)
         assert (done.code, done.out) == (1, "")
         assert "no reply: " in done.err

@@ -1,5 +1,6 @@
 """The `check` command: validates the file and prints the plan of each line."""
 
+import json
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ from rich.text import Text
 from gateway.cli.config.modem_plan import modem_plan, modem_warnings
 from gateway.cli.config.served_plan import served_plan
 from gateway.cli.progress import progress
-from gateway.cli.terminal import FAILED, ConfigPath, err, out
+from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
 from gateway.config.loading import written
 from gateway.config.messages import dotted
@@ -43,6 +44,7 @@ def check(
     expand: Annotated[
         bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
     if expand:
@@ -53,24 +55,50 @@ def check(
         loaded = load(config, report)
         warnings = zenoh_warnings(loaded) + exposure.check(loaded) + _open_to_all(loaded)
         lines = forecasts(loaded, report)
-    few = sum(len(line.blocks) for line in lines) <= 100
-    out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for part in _special(loaded, lines):
-        out.print(part)
-    for note in _notes(loaded):
-        err.print(f"note: {note}")
     warnings += [*door_warnings(loaded, lines), *_too_large(loaded)]
     by_name = {line.name: line for line in loaded.lines}
     warnings += [text for one in lines for text in modem_warnings(by_name[one.name], one)]
-    for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
-        err.print(f"warning: {warning}")
-    if unwritable := list(_unwritable(loaded)):
-        for sentence in unwritable:
-            err.print(f"error: {sentence}")
+    warnings = [*(line.advice() for line in lines if line.overloaded), *warnings]
+    notes, errors = [*_notes(loaded)], [*_unwritable(loaded)]
+    if as_json:
+        found = {"notes": notes, "warnings": warnings, "errors": errors}
+        print(json.dumps({"file": str(config), "lines": [*map(_document, lines)], **found}))
+    else:
+        few = sum(len(line.blocks) for line in lines) <= 100
+        out.print(plan(lines, every_block=few if blocks is None else blocks))
+        for part in _special(loaded, lines):
+            out.print(part)
+        for kind, sentences in (("note", notes), ("warning", warnings), ("error", errors)):
+            for sentence in sentences:
+                err.print(f"{kind}: {sentence}")
+    if errors:
         sys.exit(FAILED)
-    print(f"{config}: good, {size(loaded)}")
+    if not as_json:
+        print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _document(line: LineForecast) -> dict[str, object]:
+    """Returns the plan of a line for programs. Times in seconds."""
+    blocks = [
+        {
+            "device": row.device.name,
+            "request": describe(row.block),
+            "tags": [tag.key for tag in row.block.tags],
+            "every": row.block.every,
+            "takes": row.seconds,
+            "worst_age": row.worst_age,
+        }
+        for row in line.blocks
+    ]
+    numbers = ("load", "load_proven", "requests", "characters", "cycle", "worst_write")
+    return {
+        "line": line.name,
+        "baudrate": line.wire.baudrate,
+        **{name: getattr(line, name) for name in numbers},
+        "blocks": blocks,
+    }
 
 
 def _special(config: Config, lines: Sequence[LineForecast]) -> Iterator[RenderableType]:

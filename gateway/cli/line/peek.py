@@ -1,6 +1,7 @@
 """The `peek` command: addresses of a device in every type, to find out what they mean."""
 
 import asyncio
+import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -17,7 +18,7 @@ from gateway.cli.client import Client, connected
 from gateway.cli.line import direct
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.peek_table import Cell, change_text, table_of
-from gateway.cli.terminal import FAILED, end, err, out
+from gateway.cli.terminal import FAILED, AsJson, end, err, out
 from gateway.config import Config, built, load
 from gateway.config.settings import parsers
 from gateway.config.yaml.scalars import scalar
@@ -61,6 +62,7 @@ def peek(
         bool, typer.Option("--watch", help="Read again and again; mark changes. Ctrl-C ends it.")
     ] = False,
     every: Annotated[str, typer.Option(help="the interval with --watch")] = "500ms",
+    as_json: AsJson = False,
 ) -> None:
     """Read a range of addresses and print it in every type and word order. Only reads.
 
@@ -80,7 +82,11 @@ def peek(
         samples = asyncio.run(direct.read(view.config, view.tags)) if ask is None else ask()
     view.samples(samples)
     some = any(sample.quality is Quality.GOOD for sample in samples)
-    if some:
+    if as_json:
+        for tag in view.tags:
+            cell = view.cell(tag)
+            print(json.dumps({"address": cell.address, "raw": cell.raw, "note": cell.note}))
+    elif some:
         out.print(view.table(out.width))
     for failure in dict.fromkeys(sample.detail for sample in samples if sample.detail):
         err.print(failure)

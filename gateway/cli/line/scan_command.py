@@ -1,16 +1,17 @@
 """The `scan` command: prints the stations that reply at a port, as the file writes them."""
 
 import asyncio
+import json
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from gateway.cli.line import scan as scanning
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
-from gateway.cli.line.scan import Report, spoken
+from gateway.cli.line.scan import Found, Report, spoken
 from gateway.cli.tables import value_text
-from gateway.cli.terminal import FAILED, end, err
+from gateway.cli.terminal import FAILED, AsJson, end, err
 
 BaudOption = Annotated[str | None, typer.Option(help="9600,19200 (default: the usual ones)")]
 FormatOption = Annotated[
@@ -28,13 +29,22 @@ def scan(
     baud: BaudOption = None,
     serial_format: FormatOption = None,
     timeout: TimeoutOption = "200ms",
+    as_json: AsJson = False,
 ) -> None:
     """Find the stations at a port, their speed and their format.
 
     Sends only requests that change nothing. No gateway may be running at that port.
     """
     plan = scanning.planned(port, protocol, stations, baud, serial_format, timeout)
-    print(found_stations(scanned(plan, f"no station replied at {port}"), port))
+    report = scanned(plan, f"no station replied at {port}")
+    if not as_json:
+        print(found_stations(report, port))
+        return
+    for found in report.found:
+        line = dict[str, object]()
+        if (serial := found.serial) is not None:
+            line = {"baudrate": serial.baudrate, "format": str(serial.format)}
+        print(json.dumps({"port": port, **line, **_device(found), "refusal": found.refusal}))
 
 
 def scanned(plan: scanning.Plan, none_replied: str) -> Report:
@@ -56,12 +66,17 @@ def found_stations(report: Report, port: str) -> str:
         lines += [f"    baudrate: {serial.baudrate}", f"    format: {serial.format}"]
     lines.append("    devices:")
     for found in report.found:
-        driver = found.driver
-        named = {"protocol": driver.protocol, "station": driver.station, **found.settings}
-        settings = ", ".join(f"{name}: {value_text(value)}" for name, value in named.items())
+        texts = (f"{name}: {value_text(value)}" for name, value in _device(found).items())
         refusal = f"  # error reply: {found.refusal}" if found.refusal else ""
-        lines.append(f"      station-{driver.station}: {{{settings}, tags: {{}}}}{refusal}")
+        name = f"station-{found.driver.station}"
+        lines.append(f"      {name}: {{{', '.join(texts)}, tags: {{}}}}{refusal}")
     return "\n".join(lines)
+
+
+def _device(found: Found) -> dict[str, Any]:
+    """Returns the settings of a station in the file."""
+    driver = found.driver
+    return {"protocol": driver.protocol, "station": driver.station, **found.settings}
 
 
 def noises(report: Report) -> Iterator[str]:

@@ -1,0 +1,48 @@
+"""Two examples for the `--help` of each command, as people copy them."""
+
+from collections.abc import Mapping
+
+# A command that takes one argument at most has one.
+EXAMPLES: Mapping[str, tuple[str, ...]] = {
+    "run": ("plant.yaml", "plant.yaml --log-format json"),
+    "check": ("plant.yaml", "plant.yaml --strict --json"),
+    "read": ("plant.yaml mixer", "plant.yaml mixer/speed --direct"),
+    "write": ("plant.yaml mixer/recipe 7", "plant.yaml mixer recipe=7 speed=12.5"),
+    "watch": ("plant.yaml", "plant.yaml 'mixer/**' --json"),
+    "control": ("plant.yaml mixer stop", "plant.yaml mixer model --direct"),
+    "scan": (
+        "--port /dev/ttyUSB0 --protocol vigor",
+        "--port tcp://10.0.0.7:4001 --protocol modbus-rtu --stations 1-31 --json",
+    ),
+    "peek": (
+        "plant.yaml mixer D100..D119 --watch",
+        "D100..D119 --port /dev/ttyUSB0 --protocol vigor --station 1",
+    ),
+    "new": ("plant.yaml", "plant.yaml --port /dev/ttyUSB0 --protocol vigor --tags tags.csv"),
+    "import": ("tags.csv", "tags.xlsx --into plant.yaml --device mixer"),
+    "export": ("plant.yaml --output tags.csv", "plant.yaml mixer --decimal-comma"),
+    "simulate": ("plant.yaml --tcp 127.0.0.1:5020", "plant.yaml --links /tmp/plant"),
+    "status": ("plant.yaml --watch", "plant.yaml --json"),
+    "health": ("plant.yaml", "plant.yaml --strict"),
+    "doctor": ("plant.yaml", "plant.yaml --json"),
+    "alarms": ("plant.yaml", "plant.yaml --ack mixer/level --by ana"),
+    "notify": ("plant.yaml", "plant.yaml mail"),
+    "audit": ("plant.yaml", "plant.yaml --time '[now(-1d)..]'"),
+    "trace": ("plant.yaml hall-1", "plant.yaml hall-1 --for 30s --record recording"),
+    "replay": ("recording", "recording --config plant.yaml --check"),
+    "backup": ("plant.yaml copy.db",),
+    "schema": ("", "--contract"),
+    "version": ("",),
+    "history export": (
+        "plant.yaml mixer/speed --time '[now(-8h)..]'",
+        "plant.yaml 'mixer/**' --bucket 15min --output mixer.csv",
+    ),
+    "history salvage": ("plant.yaml",),
+    "history known": ("plant.yaml",),
+}
+
+
+def epilog(command: str) -> str:
+    """Returns the end of its help. A line of its own for each example."""
+    shown = [f"  plc-gateway {command} {one}".rstrip() for one in EXAMPLES.get(command, ())]
+    return "\b\n" + "\n".join(["Examples:", *shown]) if shown else ""
