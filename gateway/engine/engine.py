@@ -35,6 +35,7 @@ from gateway.engine.results.identities import wrong_device
 from gateway.engine.results.listening import ONLY_LISTENS, listens
 from gateway.engine.results.next_job import NextJob
 from gateway.engine.results.poll_rules import PollRules
+from gateway.engine.results.proofs import Proofs
 from gateway.engine.results.request_rules import RequestRules
 from gateway.engine.results.rule import NEVER, Rules
 from gateway.engine.results.staleness import Staleness
@@ -76,7 +77,9 @@ class Engine:
         self._polls = PollRules(self.schedule, health, effects)
         self._requests = RequestRules(self.schedule, health, effects)
         gap = max(GAP, 4 * wire.character)
-        self._next_job = NextJob(in_flight, health, self._polls, self._requests, effects, gap)
+        proofs = Proofs(self.schedule, in_flight, health, self._polls)
+        results = health, self._polls, self._requests
+        self._next_job = NextJob(in_flight, proofs, *results, effects, gap)
         shared = (self.record, self.schedule, in_flight, staleness, health, effects)
         self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
         self._charged: Device | None = None  # its use of the wire grows: by due polls, and probes
@@ -145,7 +148,7 @@ class Engine:
                 units = cast("Sequence[int]", result)
                 shapes, extra = job.device.shapes, traffic.extra > 0
                 if shapes is not None and (extra or shapes.quiet == WARY):
-                    self._next_job.hold(HeldRead(entry, units, now, time, extra))
+                    self._next_job.proofs.hold(HeldRead(entry, units, now, time), extra=extra)
                 else:
                     self._polls.read(entry, units, now, time)
             else:
@@ -272,8 +275,7 @@ class Engine:
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
-        if (held := self._in_flight.held) is not None:
-            held.doubt()  # they may be a part of its own reply
+        self._in_flight.doubt()  # they may be a part of the own reply to a held read
         if listens(self.devices):
             self.record.count(len(data) * self.wire.character, 0.0)  # of another master
         else:

@@ -96,7 +96,7 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
             for one, age in zip(blocks, worst_ages(blocks), strict=True)
         ),
         load=load,
-        load_proven=load + sum(one.device.proof_seconds / one.block.every for one in blocks),
+        load_proven=load + sum(device.load_of_proofs for device in devices),
         requests=requests,
         characters=sum(sum(one.block.cost) / one.block.every for one in blocks),
         cycle=cycle,

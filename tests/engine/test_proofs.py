@@ -10,13 +10,16 @@ from gateway.engine.device.health import State
 from gateway.engine.device.reply_shapes import SHOWN, WARY_FOR
 from gateway.engine.forecast import forecast
 from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
-from gateway.engine.results.next_job import UNPROVEN
+from gateway.engine.results.proofs import UNPROVEN
 from gateway.errors import Refusal, Refused
+from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import Ack
-from gateway.protocols.driver import EVERY_REQUEST
-from gateway.tags import Quality
+from gateway.protocols.driver import EVERY_REQUEST, PROOF
+from gateway.protocols.modbus import ModbusRtu
+from gateway.tags import Quality, WriteRule
 from tests.engine.rig import LOST, REPLIED, SECOND, SILENCE, Rig, link_device, tcp_device
 from tests.sim.bench import WIRE
+from tests.sim.plant import made_device, make_tag
 
 REFUSED = Refused("it lacks the address", code="06", refusal=Refusal.ADDRESS)
 
@@ -254,3 +257,141 @@ def test_numbered_replies_need_no_proof() -> None:
     one = forecast("line", [rig.device], WIRE)
     assert one.load_proven == one.load
     assert not rig.device.is_doubtful
+
+
+def of_blocks(driver: Any, *texts: str) -> Rig:
+    """A doubtful device with a block for each of the texts, polled every second."""
+    tags = [make_tag(text, driver, write=WriteRule()) for text in texts]
+    rig = doubtful(made_device("plc1", driver, WIRE, replace(driver.timing, retries=1), tags))
+    assert rig.device.shapes is not None
+    rig.device.shapes.extra_arrived(rig.now)  # whatever the protocol
+    while rig.device.health.needs_resync:
+        rig.conclude(rig.transacted(), Resynced(EVERY_REQUEST))
+    return rig
+
+
+def reads(rig: Rig) -> tuple[int, Probe]:
+    """Performs polls until a resync follows. Returns their number, and the resync."""
+    rig.samples.clear()
+    job = rig.transacted()
+    for count in range(20):
+        if isinstance(job, Probe):
+            return count, job
+        rig.conclude(job, [7] * job.span.size)  # type: ignore[union-attr]
+        assert not good(rig)
+        job = rig.next()  # type: ignore[assignment]
+    raise AssertionError("no resync")
+
+
+def rounds(rig: Rig, count: int, told_from: int = EVERY_REQUEST) -> list[int]:
+    """Returns for each round how many reads its resync proved."""
+    proven = []
+    for _ in range(count):
+        rig.now += 5.0  # all blocks are due
+        number, probe = reads(rig)
+        rig.conclude(probe, Resynced(told_from))
+        proven.append(number)
+        if isinstance(rig.engine._in_flight.continuation, Settle):  # no public entry shows it
+            rig.conclude(rig.transacted(), Settled(None))
+        read = {id(rig.engine.reader(rig.device, sample.tag)) for sample in rig.samples}
+        assert len(read) == number
+        assert good(rig)
+    return proven
+
+
+PLACES = (base + n for base in (0, 1000, 2000, 3000) for n in range(12))
+BLOCKS = ("D0", "D1000", "D2000", "D3000")
+
+
+def test_one_resync_proves_more_and_more_reads() -> None:
+    assert rounds(of_blocks(ComputerLink(station=1, monitor=False), *BLOCKS), 3) == [1, 2, 4]
+
+
+def test_a_read_is_proven_alone_where_a_reply_to_it_may_answer_the_resync() -> None:
+    """Its registers allow no resync of a form that none of the reads has."""
+    rig = of_blocks(ModbusRtu(station=1), "holding:10", "holding:500")
+    assert rounds(rig, 3, told_from=1) == [1, 1, 1]
+
+
+def test_a_read_of_a_form_of_its_own_proves_several_in_silence() -> None:
+    """Another master may ask for this form, too."""
+    rig = of_blocks(ModbusRtu(station=1), *(f"holding:{n}" for n in PLACES))
+    rounds(rig, 1)
+    rig.now += 10.0
+    count, probe = reads(rig)
+    assert (count, probe.token) == (2, PROOF)
+    rig.conclude(probe, Resynced(EVERY_REQUEST))
+    assert not good(rig)
+    assert isinstance(rig.next(), Settle)
+
+
+@pytest.mark.parametrize("how", ["extra reply", "no reply", "resync without a reply"])
+def test_all_reads_that_wait_are_read_again_and_the_next_is_proven_alone(how: str) -> None:
+    rig = of_blocks(ComputerLink(station=1, monitor=False), *BLOCKS)
+    rounds(rig, 2)
+    rig.now += 10.0
+    job = rig.transacted()
+    assert isinstance(job, Poll)
+    rig.samples.clear()
+    rig.conclude(job, [7] * job.span.size)
+    second = rig.next()
+    assert isinstance(second, Poll)
+    if how == "no reply":
+        rig.fail(second)
+    else:
+        if how == "extra reply":
+            hear(rig)
+        rig.conclude(second, [7] * second.span.size)
+        probe = reads(rig)[1]
+        if how == "extra reply":
+            rig.conclude(probe, Resynced(EVERY_REQUEST))
+        else:
+            rig.fail(probe)
+    assert not good(rig)
+    while rig.device.health.needs_resync:
+        rig.conclude(rig.transacted(), Resynced(EVERY_REQUEST))
+    assert reads(rig)[0] == 1
+
+
+def test_a_refused_read_among_them_does_not_end_the_proof() -> None:
+    rig = of_blocks(ComputerLink(station=1, monitor=False), *BLOCKS)
+    rounds(rig, 2)
+    rig.now += 10.0
+    read(rig)
+    rig.conclude(rig.next(), REFUSED)  # type: ignore[arg-type]
+    probe = rig.next()
+    assert isinstance(probe, Poll | Probe)
+    assert rig.device.health.needs_resync
+
+
+def test_a_write_waits_for_no_other_read() -> None:
+    rig = of_blocks(ComputerLink(station=1, monitor=False), *BLOCKS)
+    rounds(rig, 2)
+    rig.now += 10.0
+    job = rig.transacted()
+    assert isinstance(job, Poll)
+    rig.write("D1000")
+    rig.conclude(job, [7] * job.span.size)
+    assert isinstance(rig.next(), Probe)
+
+
+def test_a_read_that_waits_is_not_read_again_before_its_proof() -> None:
+    """A client that waits for a newer read gets the next one."""
+    rig = of_blocks(ComputerLink(station=1, monitor=False), *BLOCKS)
+    rounds(rig, 3)
+    rig.now += 10.0
+    first = rig.transacted()
+    assert isinstance(first, Poll)
+    rig.engine.expedite(rig.device, first.block.tags[0])
+    rig.samples.clear()
+    rig.conclude(first, [7] * first.span.size)
+    blocks = [first.block]
+    while isinstance(job := rig.next(), Poll):
+        rig.conclude(job, [7] * job.span.size)
+        blocks.append(job.block)
+    assert len(set(blocks)) == len(blocks) == 4
+    rig.conclude(job, Resynced(EVERY_REQUEST))  # type: ignore[arg-type]
+    assert good(rig)
+    again = rig.transacted()
+    assert isinstance(again, Poll)
+    assert again.block is first.block

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from gateway.config import LineConfig
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
+from gateway.engine.results.proofs import LONGEST
 from gateway.line.line import Line
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
@@ -99,7 +100,7 @@ class Bus:
         if self._registering is not None:
             self._registered(self._registering)
         # Private: no document tells it.
-        self._proves = proves = self.line.engine._in_flight.held is not None
+        self._proves = proves = bool(self.line.engine._in_flight.held)
         if not proves:
             self.sent_at, self.heard, self.request = start, b"", b""
             self.own.clear()
@@ -138,10 +139,11 @@ class Bus:
 
     @property
     def proof(self) -> float:
-        """Seconds that the proof of the last read may have taken; 0.0: it had none."""
+        """Seconds that the proof of the last reads may have taken; 0.0: they had none."""
         if not self._proves or self.asked is None:
             return 0.0
-        return self.asked.timing.reply_timeout + SPOKEN + 4 * self.asked.longest_reply
+        proof = self.asked.timing.reply_timeout + SPOKEN + 4 * self.asked.longest_reply
+        return LONGEST + proof
 
     @property
     def evidence_at(self) -> float:
@@ -233,7 +235,8 @@ class Bus:
         self.story.counts["answers"] += 1
         said = self.stations[device.name].inner.said  # type: ignore[attr-defined]
         since = self.now() - SPOKE_LATELY
-        if not any(at >= since and value == number for at, _, value in said):
+        held = self.untimely(device.name)  # such a frame tells no time
+        if not any((held or at >= since) and value == number for at, _, value in said):
             self._unless_hurt(since, f"{device.name} is answered {number}, which it did not say")
 
     def _unless_hurt(self, since: float, what: str) -> None:

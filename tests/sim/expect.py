@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gateway.engine.device.device import Device
+from gateway.engine.device.device import PROOF_COST, Device
 from gateway.engine.device.health import State
 from gateway.engine.engine import Engine
 from gateway.engine.jobs.unanswered import LONGEST_WAIT
@@ -54,7 +54,7 @@ class Expectations:
         load = sum(d.load for d in line.engine.devices)
         for device in line.engine.devices:  # each read is proven, some by silence
             if device.is_doubtful:
-                proof = device.proof_seconds + device.longest_reply
+                proof = device.seconds(PROOF_COST) + device.settled_after + device.longest_reply
                 load += sum(proof / block.every for block in device.blocks)
         return longest, max(1.0, load)
 

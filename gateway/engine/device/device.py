@@ -1,6 +1,7 @@
 """The state of one device on a line: its plan, its health and its record."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
 
@@ -9,7 +10,7 @@ from gateway.engine.device.health import Health, State, diagnosis
 from gateway.engine.device.identity import Identity
 from gateway.engine.device.monitor_list import MonitorList
 from gateway.engine.device.records import Record
-from gateway.engine.device.reply_shapes import ReplyShapes, reply_shapes
+from gateway.engine.device.reply_shapes import MOST_HELD, ReplyShapes, reply_shapes
 from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.device.turnaround import Turnaround
 from gateway.errors import Evidence, Garbled, LineDown, NoReply
@@ -207,9 +208,16 @@ class Device:
         return self.longest_poll + QUIET_MARGIN
 
     @property
-    def proof_seconds(self) -> float:
-        """Seconds that prove a read while extra replies arrive, about; 0: replies are numbered."""
-        return 0.0 if self.shapes is None else self.seconds(PROOF_COST) + self.settled_after
+    def load_of_proofs(self) -> float:
+        """The share of the wire time of the resyncs that prove its reads while extra replies
+        arrive. One is for all blocks of one interval, if its reply is told from theirs."""
+        if self.shapes is None:
+            return 0.0
+        proof = self.seconds(PROOF_COST) + self.settled_after
+        loops = self.shapes.of_resync(None, 2, self.probe_spans) is None
+        most = MOST_HELD if loops or self.may_be_proven else 1
+        blocks = Counter(block.every for block in self.blocks)
+        return sum(math.ceil(count / most) * proof / every for every, count in blocks.items())
 
     @property
     def is_doubtful(self) -> bool:

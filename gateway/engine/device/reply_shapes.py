@@ -22,6 +22,7 @@ WARY = 1.5  # the same after an extra reply: others may be as late
 WARY_FOR = 600.0  # seconds
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
+MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
 
 

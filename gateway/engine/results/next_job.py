@@ -1,7 +1,6 @@
 """Applies the result of a job that is no good read, and decides what follows it."""
 
 from gateway.engine.device.health import State
-from gateway.engine.device.reply_shapes import SHOWN
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import (
     Answer,
@@ -27,8 +26,9 @@ from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
+from gateway.engine.results.proofs import Proofs
 from gateway.engine.results.request_rules import RequestRules
-from gateway.engine.schedule.in_flight import HeldRead, InFlight
+from gateway.engine.schedule.in_flight import InFlight
 from gateway.errors import (
     BadValue,
     DeviceError,
@@ -41,7 +41,6 @@ from gateway.errors import (
 )
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
-UNPROVEN = "extra replies arrive on this line, and nothing proves this read"
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
 
 
@@ -55,6 +54,7 @@ class NextJob:
     def __init__(
         self,
         in_flight: InFlight,
+        proofs: Proofs,
         results: HealthRules,
         polls: PollRules,
         requests: RequestRules,
@@ -65,6 +65,7 @@ class NextJob:
         # An earlier process may have left requests in a device server, until the wire was quiet.
         self.inherits = False
         self._in_flight = in_flight
+        self.proofs = proofs
         self._results = results
         self._polls = polls
         self._requests = requests
@@ -82,56 +83,17 @@ class NextJob:
             case Refused():
                 results.answered(device, now, time)
                 self._polls.refused(poll, result, now, time)
+                self.proofs.refused(device, now)
             case Unsteady():
                 results.answered(device, now, time)
                 self._polls.unsteady(poll, result, now, time)
+                self.proofs.refused(device, now)
             case DeviceError():
                 self._in_flight.failed.append((poll, result))
             case LineDown():
                 device.health.left_outstanding(poll.job.span, now)
             case Exception():
                 raise result
-
-    def hold(self, read: HeldRead) -> None:
-        """Holds the values of a good read until a resync proves it: its line has extra replies.
-
-        If another reply was taken for its own, its own is outstanding, and arrives before that to
-        the resync.
-        """
-        device, now = read.poll.device, read.now
-        health, shapes = device.health, device.shapes
-        if read.doubted:
-            self._results.answered_twice(device, now, read.time)
-        health.left_outstanding(read.poll.job.span, now)
-        probe = Probe(device, health.outstanding, health.next_probe_token())
-        if shapes is not None:
-            shapes.probed(probe.outstanding, probe.token, device.probe_spans, now)
-        self._in_flight.hold(read)
-        self._in_flight.follow(probe)
-
-    def _proven(self, told_from: int, now: float, time: int) -> None:
-        """Releases the read that waited for this resync, if no extra reply has arrived.
-
-        The reply to the resync may be another one, too, unless its like exists only once. Then
-        the wire must be quiet after it: the own replies would arrive.
-        """
-        held = self._in_flight.held
-        if held is None or (shapes := held.poll.device.shapes) is None:
-            return
-        if held.doubted or told_from == EVERY_REQUEST or now - shapes.wary_at >= SHOWN:
-            self._release(now, time)
-            return
-        device = held.poll.device
-        guard = device.longest_reply + device.settled_after
-        self._in_flight.follow(Settle(device, guard, device.settled_after, held.poll.job))
-
-    def _release(self, now: float, time: int, *, proven: bool = True) -> None:
-        """Ends the read that waited for a proof, if there is one."""
-        held = self._in_flight.release()
-        if held is not None and proven and not held.doubted:
-            self._polls.read(held.poll, held.units, held.now, held.time)
-        elif held is not None:
-            self._polls.unsteady(held.poll, Unsteady(UNPROVEN), now, time)
 
     def polls_ended(self, traffic: Traffic, now: float, time: int) -> None:
         """Applies the end of a transaction of polls, some of which failed."""
@@ -160,8 +122,8 @@ class NextJob:
         self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         device = probe.device
-        if traffic.extra and (held := self._in_flight.held) is not None:
-            held.doubt()
+        if traffic.extra:
+            self._in_flight.doubt()
         match result:
             case (
                 Resynced() | Refused()
@@ -184,7 +146,7 @@ class NextJob:
                         self.inherits = False
                         device.health.inherit(inherits=False)
                     self._results.answered(device, now, time, resynced=True)
-                    self._proven(EVERY_REQUEST if probe.again else told_from, now, time)
+                    self.proofs.resynced(probe, told_from, now, time)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
             case LineDown():  # its reply may still arrive, on the next connection
@@ -217,7 +179,7 @@ class NextJob:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
-        self._release(now, time, proven=False)
+        self.proofs.release(now, time, proven=False)
         known = isinstance(job, Poll) or (isinstance(job, Probe) and job.token != PROOF)
         before = self._results.unclear(device, error, span_of(job), now, time, known=known)
         no_guard = before is State.OFFLINE or _is_short(job) or self._is_lost(job, error, now)
@@ -245,7 +207,7 @@ class NextJob:
         device, after = settle.device, settle.after
         if settle.error is None:
             if isinstance(after, Poll):
-                self._release(now, time, proven=isinstance(result, Settled) and result.quiet)
+                self.proofs.release(now, time, proven=isinstance(result, Settled) and result.quiet)
             elif isinstance(result, Settled) and not result.quiet:
                 self.inherits = False  # it is another master that speaks
                 device.health.inherit(inherits=False)
@@ -275,6 +237,8 @@ class NextJob:
     def abandon(self, error: LineDown | None, now: float) -> None:
         """Ends the job, because the port was lost or the gateway stops."""
         job = self._in_flight.continuation or self._in_flight.job
+        if isinstance(job, PollEntry):
+            job = job.job
         self._in_flight.clear()
         if job is not None:
             self._requests.abandon(job, error, now)

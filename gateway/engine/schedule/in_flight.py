@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Confirm, Poll, ReadBack, Repeat, Transacted
@@ -9,19 +10,13 @@ from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.errors import DeviceError
 
 
-@dataclass(slots=True)
-class HeldRead:
+class HeldRead(NamedTuple):
     """A good read whose values wait for a proof. Times of its reply."""
 
     poll: PollEntry
     units: Sequence[int]
     now: float
     time: int
-    doubted: bool = False  # an extra reply arrived since
-
-    def doubt(self) -> None:
-        """Notes an extra reply."""
-        self.doubted = True
 
 
 @dataclass(slots=True)
@@ -32,40 +27,50 @@ class InFlight:
     begun: float = 0.0  # by the line's clock
     open: dict[Poll, PollEntry] = field(default_factory=dict)  # polls that are not concluded
     failed: list[tuple[PollEntry, DeviceError]] = field(default_factory=list)
-    continuation: Transacted | None = None
-    held: HeldRead | None = None  # its proof is under way
+    continuation: Transacted | PollEntry | None = None
+    held: list[HeldRead] = field(default_factory=list)  # of one device; one proof is for all
+    doubted: bool = False  # an extra reply arrived since the first of them
 
-    def follow(self, job: Transacted) -> None:
+    def follow(self, job: Transacted | PollEntry) -> None:
         """Notes the job that must follow."""
         self.continuation = job
 
     def hold(self, read: HeldRead) -> None:
         """Notes a read whose values wait."""
-        self.held = read
+        self.held.append(read)
+
+    def doubt(self) -> None:
+        """Notes an extra reply."""
+        self.doubted = bool(self.held)
 
     def doubts(self, device: Device) -> bool:
-        """Notes an extra reply of the device. Returns True if one of its reads waited."""
-        if self.held is None or self.held.poll.device is not device:
+        """Notes an extra reply of the device. Returns True if reads of it waited."""
+        if not self.held or self.held[0].poll.device is not device:
             return False
-        self.held.doubt()
+        self.doubted = True
         return True
 
-    def release(self) -> HeldRead | None:
-        """Returns the read whose values waited, once."""
-        held, self.held = self.held, None
-        return held
+    def release(self) -> tuple[Sequence[HeldRead], bool]:
+        """Returns the reads whose values waited, once, and True if an extra reply arrived."""
+        held, doubted = self.held, self.doubted
+        self.held, self.doubted = [], False
+        return held, doubted
 
     def clear(self) -> None:
         """No job is handed out any more."""
-        self.job = self.continuation = self.held = None
+        self.job = self.continuation = None
+        self.release()
         self.open.clear()
         self.failed.clear()
 
     def resume(self, now: float) -> Transacted:
-        """Returns the continuation. All but `Settle` and `Probe` begin their own time."""
+        """Returns the continuation. All but polls, `Settle` and `Probe` begin their own time."""
         job, self.continuation = self.continuation, None
         if job is None:
             raise AssertionError("no continuation")
+        if isinstance(job, PollEntry):
+            self.open[job.job] = job
+            job = job.job
         self.job = job
         if isinstance(job, ReadBack | Confirm | Repeat):
             self.begun = now

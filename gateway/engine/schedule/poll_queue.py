@@ -3,7 +3,7 @@
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.engine.device.device import Device
@@ -94,15 +94,17 @@ class PollQueue:
             self.push(poll)
 
     def expedite(self, poll: PollEntry, *, on_demand: bool = False) -> None:
-        """Puts the poll before all due polls; on demand behind those that are not."""
+        """Puts the poll before all due polls, behind those that were before; on demand behind all
+        that are not."""
         if on_demand and poll.ticket > EXPEDITED:
             poll.queue(ON_DEMAND)
             self.expedited.append(poll)
         elif not on_demand and poll.ticket != EXPEDITED:
             if poll.ticket == ON_DEMAND:
                 self.expedited.remove(poll)
+            place = sum(other.ticket == EXPEDITED for other in self.expedited)
             poll.ticket = EXPEDITED
-            self.expedited.appendleft(poll)
+            self.expedited.insert(place, poll)
 
     def first_to_differ(self, first: PollEntry, now: float) -> PollEntry:
         """Returns the first due poll, or in its place one of the next whose reply has another shape
@@ -151,9 +153,16 @@ class PollQueue:
             self.due = due = self._own.first() if self._own is not None else None
         return due is not None or bool(expedited)
 
-    def more(self, device: Device, most: int) -> list[PollEntry]:
-        """Takes out more due polls of the device, by deadline."""
-        own, taken = self.by_device.get(device), list[PollEntry]()
+    def more(self, device: Device, most: int, held: Collection[PollEntry] = ()) -> list[PollEntry]:
+        """Takes out more polls of the device: expedited ones, then due ones by deadline.
+
+        `held`: polls that were read, and have not ended yet. A client may wait for their next read.
+        """
+        ready = (one for one in self.expedited if one.device is device and one.live)
+        taken = [one for one in ready if one not in held][:most]
+        for one in taken:
+            self.expedited.remove(one)
+        own = self.by_device.get(device)
         while own is not None and len(taken) < most and (poll := own.first()) is not None:
             heapq.heappop(own.heap)
             taken.append(poll)

@@ -1,7 +1,7 @@
 """Decides the next job of one line."""
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
@@ -289,9 +289,11 @@ class Schedule:
             return True
         return now + poll.device.seconds(poll.block.cost) <= until
 
-    def alongside(self, device: Device, most: int, now: float) -> list[PollEntry]:
-        """Returns more due polls of the device, if it accepts several requests at once."""
-        return [other.hand_out(now) for other in self._queue.more(device, most)]
+    def alongside(
+        self, device: Device, most: int, now: float, held: Collection[PollEntry] = ()
+    ) -> list[PollEntry]:
+        """Returns more due polls of the device. `held`: polls that have not ended yet."""
+        return [other.hand_out(now) for other in self._queue.more(device, most, held)]
 
     def _first_without_resync(self) -> PollEntry | None:
         """Returns the due poll with the earliest deadline whose device needs no resync, and is

@@ -1,0 +1,94 @@
+"""Proofs: holds good reads of a line with extra replies until a resync shows that each is right."""
+
+from collections.abc import Sequence
+
+from gateway.engine.device.device import Device
+from gateway.engine.device.reply_shapes import MOST_HELD, SHOWN
+from gateway.engine.jobs.jobs import Probe, Settle
+from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.poll_rules import PollRules
+from gateway.engine.schedule.in_flight import HeldRead, InFlight
+from gateway.engine.schedule.schedule import Schedule
+from gateway.errors import Unsteady
+from gateway.protocols.driver import EVERY_REQUEST, PROOF
+
+LONGEST = 0.5  # seconds: then reads get their proof
+UNPROVEN = "extra replies arrive on this line, and nothing proves this read"
+
+
+class Proofs:
+    """Holds reads of one device, and has one resync prove them.
+
+    If another reply was taken for that to a read, the own one is outstanding. It arrives before
+    that to the resync, as one too many. So one resync proves all reads since the one before.
+    """
+
+    def __init__(
+        self, schedule: Schedule, in_flight: InFlight, results: HealthRules, polls: PollRules
+    ) -> None:
+        self._schedule = schedule
+        self._in_flight = in_flight
+        self._results = results
+        self._polls = polls
+        self._most = 1  # reads for one resync: noise destroys the proof of many more often
+
+    def hold(self, read: HeldRead, *, extra: bool) -> None:
+        """Holds the values of a good read. `extra`: an extra reply arrived with its own."""
+        device, now = read.poll.device, read.now
+        self._in_flight.hold(read)
+        if extra:
+            self._results.answered_twice(device, now, read.time)
+        self._go_on(device, [read], now)
+
+    def refused(self, device: Device, now: float) -> None:
+        """Goes on after a read that was refused: its reply ended all outstanding requests."""
+        if held := self._in_flight.held:
+            self._go_on(device, held, now)
+
+    def _go_on(self, device: Device, outstanding: Sequence[HeldRead], now: float) -> None:
+        """Reads another due block of the device, or sends the resync."""
+        in_flight, health, shapes = self._in_flight, device.health, device.shapes
+        if shapes is None:
+            return
+        for read in outstanding:
+            health.left_outstanding(read.poll.job.span, now)
+        token = PROOF if device.may_be_proven else health.next_probe_token()
+        last, spans = health.outstanding, device.probe_spans
+        is_told = token == PROOF or shapes.of_resync(last, token, spans) is None
+        ends = self._schedule.requests.waiting or now - in_flight.begun >= LONGEST
+        most = 0 if ends or in_flight.doubted or not is_told else self._most
+        held = [read.poll for read in in_flight.held]
+        if others := self._schedule.alongside(device, int(len(held) < most), now, held):
+            in_flight.follow(others[0])
+            return
+        shapes.probed(last, token, spans, now)
+        in_flight.follow(Probe(device, last, token))
+
+    def resynced(self, probe: Probe, told_from: int, now: float, time: int) -> None:
+        """Releases the reads that waited for this resync, if no extra reply has arrived.
+
+        The reply to the resync may be another one, too, unless its like exists only once. Then
+        the wire must be quiet after it: the own replies would arrive.
+        """
+        device, in_flight = probe.device, self._in_flight
+        if not in_flight.held or (shapes := device.shapes) is None:
+            return
+        only = probe.again or (told_from == EVERY_REQUEST and probe.token != PROOF)
+        if in_flight.doubted or only or now - shapes.wary_at >= SHOWN:
+            self.release(now, time)
+            return
+        guard = device.longest_reply + device.settled_after
+        after = in_flight.held[-1].poll.job
+        in_flight.follow(Settle(device, guard, device.settled_after, after))
+
+    def release(self, now: float, time: int, *, proven: bool = True) -> None:
+        """Ends the reads that waited for a proof, if there are any."""
+        held, doubted = self._in_flight.release()
+        proven = proven and not doubted
+        if held:
+            self._most = min(2 * self._most, MOST_HELD) if proven else 1
+        for read in held:
+            if proven:
+                self._polls.read(*read)
+            else:
+                self._polls.unsteady(read.poll, Unsteady(UNPROVEN), now, time)
