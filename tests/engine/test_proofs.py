@@ -395,3 +395,20 @@ def test_a_read_that_waits_is_not_read_again_before_its_proof() -> None:
     again = rig.transacted()
     assert isinstance(again, Poll)
     assert again.block is first.block
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_read_of_an_old_plan_makes_no_value(waits: bool) -> None:
+    """No poll would know its age, so it would stay good for ever."""
+    rig = doubtful() if waits else Rig()
+    if waits:
+        read(rig)
+    else:
+        rig.bring(State.ONLINE)
+        job = rig.transacted()
+    rig.engine.schedule.plan(rig.device, rig.now)
+    if waits:
+        prove(rig)
+    else:
+        rig.conclude(job, [7] * job.span.size)  # type: ignore[union-attr]
+    assert not good(rig)

@@ -46,7 +46,10 @@ class PollRules:
             self._replans.forget(device)
 
     def read(self, poll: PollEntry, units: Sequence[int], now: float, time: int) -> None:
-        """Applies a good read of a block."""
+        """Applies a good read of a block. One of an old plan counts for nothing: another poll reads
+        its tags, and does not know the age of these values."""
+        if not poll.live:
+            return
         device, block = poll.device, poll.block
         health = device.health
         if health.needs_resync or health.state is not State.ONLINE:
