@@ -25,6 +25,7 @@ class DeviceServer:
     def __init__(self, *speaking: int, latency: float = 0.0) -> None:
         self.speaking = set(speaking)
         self.heard: list[tuple[float, int, bytes]] = []  # time, station, request
+        self.opened: list[int] = []  # by connection: the requests before it
         self.latency = latency
         self._plcs = {number: VigorStation(number) for number in range(1, STATIONS + 1)}
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -54,6 +55,7 @@ class DeviceServer:
         with suppress(OSError):
             while True:
                 self._peer, _ = self._listener.accept()
+                self.opened.append(len(self.heard))
                 with self._peer as peer, suppress(OSError):
                     while data := peer.recv(4096):
                         self._hear(peer, data)
@@ -95,11 +97,12 @@ def test_silent_stations_first_in_the_file_do_not_keep_the_last_one_dark(tmp_pat
         begun = server.heard[0][0]
         second = [at for at, station, _ in server.heard if station == HEALTHY][1]
         assert second - begun < 1.2 * (STATIONS - 1) / 2
-        count = len(server.heard)
+        before = len(server.opened)
         server.reset()
-        until(lambda: len(server.heard) > count + 1, "the line is open again")
-        # A request of the old connection may have been on its way.
-        assert HEALTHY in {station for _, station, _ in server.heard[count : count + 2]}
+        until(lambda: len(server.opened) > before, "the line is open again")
+        first = server.opened[before]
+        until(lambda: len(server.heard) > first, "a station is asked")
+        assert server.heard[first][1] == HEALTHY
 
 
 def test_a_silent_station_is_asked_every_few_seconds_and_read_when_it_returns(
