@@ -121,7 +121,7 @@ bundle: build/tools/ready
 	build/tools/bin/python -m tools.release $(if $(MACHINES),--machines "$(MACHINES)") \
 	    $(if $(PYTHONS),--pythons "$(PYTHONS)")
 
-# Long proofs (docs/proof.md); a short slice of each runs with the tests.
+# Long proofs (docs/contributors/proof.md); a short slice of each runs with the tests.
 SEEDS ?= 0-19
 HOURS ?= 1
 PACE ?= busy
@@ -148,7 +148,7 @@ mutants: .venv/ready
 	$(BIN)/python -m tests.sim.mutants --sample $(SAMPLE) --seed $(SEED) $(ONLY) \
 	    $(if $(WORKERS),--workers $(WORKERS))
 
-# Faults as an operator meets them, and what each place says of them (docs/operator.md).
+# Faults as an operator meets them, and what each place says of them (docs/find-a-fault.md).
 operator: .venv/ready
 	$(BIN)/python -m tests.faults.operator
 
@@ -160,7 +160,7 @@ histories: .venv/ready
 crowd: .venv/ready
 	$(BIN)/python -m tests.attacks.crowd 10000
 
-# Every parser, led by the branches that it takes: first `pip install atheris` (docs/proof.md).
+# Every parser, led by the branches that it takes: first `pip install atheris` (docs/contributors/proof.md).
 parsers: .venv/ready
 	$(BIN)/python -m tests.fuzz.long --minutes $(MINUTES)
 

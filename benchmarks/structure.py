@@ -185,7 +185,7 @@ def widest() -> tuple[int, int, str]:
     return max(classes(), key=lambda each: each[1])
 
 
-# The rows of docs/architecture.md, without those of `benchmarks.moves`.
+# The rows of docs/contributors/architecture.md, without those of `benchmarks.moves`.
 FIGURES: dict[str, Callable[[], list[int]]] = {
     "modules directly in": lambda: [
         len(list(ROOT.glob("*.py"))),

@@ -2,7 +2,7 @@
 
 `dead-route`: a peer keeps the route of a key expression to a router that was killed.
 `wildcards`: two key expressions with many `**` keep a receiving thread busy for ever.
-docs/upstream.md has the reports.
+docs/contributors/upstream.md has the reports.
 """
 
 import argparse

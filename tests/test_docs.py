@@ -49,10 +49,16 @@ from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint, free_port
 
 README = ROOT / "README.md"
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [README, *DOCS]
 OWN = [ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")]
-TEXT = {page.name if page != README else "/README.md": page.read_text("utf-8") for page in PAGES}
+FOLDERS = (ROOT / "docs", ROOT / "docs" / "contributors")
+TEXT = {
+    "/README.md" if page == README else page.relative_to(FOLDERS[0]).as_posix(): page.read_text(
+        "utf-8"
+    )
+    for page in PAGES
+}
 EXAMPLE = ROOT / "config.example.yaml"
 ENDPOINT = "tcp/127.0.0.1:7447"
 # Indented where it stands in a list.
@@ -67,7 +73,10 @@ OF_PROGRAMS = (
 # The tutorial's programs run in tests/e2e/test_story.py, the library's in
 # tests/protocols/test_library.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.
-RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md", "library.md")
+RUN_ELSEWHERE = (
+    *("scada.md", "library.md"),
+    *("contributors/wire-log-to-test.md", "contributors/architecture.md"),
+)
 
 
 class Block(NamedTuple):
@@ -535,9 +544,11 @@ def test_every_link_leads_somewhere() -> None:
     assert dead == []
 
 
-def test_the_index_names_every_page() -> None:
-    named = re.findall(r"^\| \[([\w.-]+)\]", TEXT["README.md"], re.MULTILINE)
-    assert set(named) == {page.name for page in DOCS} - {"README.md"}
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_index_names_every_page(folder: Path) -> None:
+    index = (folder / "README.md").read_text("utf-8")
+    named = re.findall(r"^\| \[([\w.-]+)\]", index, re.MULTILINE)
+    assert sorted(named) == sorted({page.name for page in folder.glob("*.md")} - {"README.md"})
 
 
 def _example_keys() -> set[str]:
@@ -776,8 +787,12 @@ def test_no_page_uses_a_word_that_hides_the_actor() -> None:
 
 
 def test_the_example_of_a_replay_is_the_one_that_the_suite_runs() -> None:
-    [shown] = [block for block in _blocks("wire-log-to-test.md") if block.language == "python"]
+    [shown] = [
+        block for block in _blocks("contributors/wire-log-to-test.md") if block.language == "python"
+    ]
     assert shown.text in (ROOT / "tests/cases/test_wire_logs.py").read_text("utf-8")
-    [log] = [block for block in _blocks("wire-log-to-test.md") if block.language == "text"]
+    [log] = [
+        block for block in _blocks("contributors/wire-log-to-test.md") if block.language == "text"
+    ]
     kept = (ROOT / "tests/cases/late_reply_and_bad_address/wire.log").read_text("utf-8")
     assert set(log.text.splitlines()) <= set(kept.splitlines())

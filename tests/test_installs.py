@@ -13,7 +13,7 @@ from tests.e2e.processes import ROOT
 
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "Dockerfile")),
-    *(ROOT / "docs").glob("*.md"),
+    *(ROOT / "docs").rglob("*.md"),
     *(path for path in (ROOT / "packaging").rglob("*") if path.is_file()),
     *(ROOT / "examples").rglob("*.py"),
     *(ROOT / "gateway").rglob("*.py"),

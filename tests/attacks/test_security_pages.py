@@ -292,7 +292,8 @@ NO_PROMISES: dict[str, tuple[str, ...]] = {
         ),
         (
             "One attack has no limit here: two key expressions with some 15 `**` each, of any "
-            "client that is connected, stop Zenoh 1.10.2 ([attacks](attacks.md#not-withstood)). "
+            "client that is connected, stop Zenoh 1.10.2 "
+            "([attacks](contributors/attacks.md#not-withstood)). "
             "Only the [connection](#restrict-connections) protects against it."
         ),
         (

@@ -1,4 +1,7 @@
-"""Reads wire logs, so that a recording from a plant becomes a test: docs/wire-log-to-test.md."""
+"""Reads wire logs, so that a recording from a plant becomes a test.
+
+docs/contributors/wire-log-to-test.md explains the method.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Wire logs of plants, one folder for each case; docs/wire-log-to-test.md explains the method."""
+"""Wire logs of plants, one folder for each case: docs/contributors/wire-log-to-test.md."""
 
 from pathlib import Path
 

@@ -26,7 +26,7 @@ from tests.engine.rig import SILENCE, Rig, bit_device, link_device, tcp_device
 from tests.sim.plant import device, make_tag
 
 HOUR = 3600.0
-PAGE = Path(__file__).parents[2] / "docs" / "beliefs.md"
+PAGE = Path(__file__).parents[2] / "docs" / "contributors" / "beliefs.md"
 ASKED, SAID = b"\x01\x03\x00\x00\x00\x01", b"\x01\x03\x02\x00\x07"
 BUSY = Refused("busy", code="06", refusal=Refusal.BUSY)
 NO_ADDRESS = Refused("no such address", code="07", refusal=Refusal.ADDRESS)

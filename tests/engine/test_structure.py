@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import moves, structure
 
-PAGE = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text("utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "contributors" / "architecture.md").read_text("utf-8")
 
 
 def now(row: str) -> list[int]:

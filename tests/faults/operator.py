@@ -3,7 +3,7 @@
 Each fault has a gateway, a router and a station of its own, in other processes. For ten seconds
 after the fault the program reads the log, the API behind the status page and the metrics, and then
 runs `plc-gateway status`. It ends with exit code 1 when no place has said anything of a fault.
-docs/operator.md has the result.
+docs/find-a-fault.md has the result.
 """
 
 import argparse

@@ -78,7 +78,7 @@ async def test_noise_makes_no_wrong_value_and_no_exception(noise: float) -> None
         await asyncio.sleep(70)
         assert all(line.good(dev) for dev in devices)
         # Two bits that cancel, in a reply, or in a request, which then reads other words: theory
-        # and measurement are in docs/residual-errors.md.
+        # and measurement are in docs/contributors/residual-errors.md.
         blind = {1e-4: 0, 1e-3: 3, 1e-2: 30}[noise]
     assert len({at for at, _, _ in witness.wrong}) <= blind
     assert witness.right > 1000

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field
 
-# Words of a report, and the rule of docs/proof.md that it breaks.
+# Words of a report, and the rule of docs/contributors/proof.md that it breaks.
 _RULES = {
     "transfer ": "transfer",
     "a foreign reply is a value": "foreign reply",

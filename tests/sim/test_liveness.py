@@ -9,7 +9,7 @@ from tests.sim.virtual import run_virtual
 SEED, SLICE = 1_000_003, 0.02  # hours
 
 
-# Flooding is not withstood at 9600 baud: docs/proof.md, "Not proven".
+# Flooding is not withstood at 9600 baud: docs/contributors/proof.md, "Not proven".
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "flooding"])
 def test_beside_a_station_that_is_broken_for_ever_all_others_live_on(kind: str) -> None:
     story = run(SEED, SLICE, only=[kind])
