@@ -38,6 +38,7 @@ from gateway.transport.port import (
     Rfc2217Address,
     SerialPath,
     TcpAddress,
+    named,
 )
 
 _WITHIN = 3.0  # seconds for a connection
@@ -137,7 +138,7 @@ def _tried(
     attempt: Callable[[], socket.socket],
     mend: str,
 ) -> Finding:
-    what = f"{port.host}:{port.port}"
+    what = named(port.host, port.port)
     if runs:
         return Finding(what, "not tried: the gateway uses it")
     try:

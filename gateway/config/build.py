@@ -39,7 +39,7 @@ from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS, fault_of
 from gateway.tags import Tag
 from gateway.tags.tag import READ, NotReal
-from gateway.transport.port import ListenAddress, ModemAddress, SerialPath
+from gateway.transport.port import ListenAddress, ModemAddress, SerialPath, SimulatorAddress
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
@@ -287,12 +287,16 @@ class Builder:
         ports: dict[object, str] = {}
         check_device_servers({line.name: line.port for line in lines}, self.mistakes)
         for line in lines:
-            if line.simulated or isinstance(line.port, ListenAddress):
+            if isinstance(line.port, SimulatorAddress | ListenAddress):
                 continue
             port = line.port.port if isinstance(line.port, ModemAddress) else line.port
-            known = realpath(port.path) if isinstance(port, SerialPath) else port
-            other = ports.setdefault(known, line.name)
-            if other != line.name:
+            places: list[object] = (
+                [realpath(port.path)]
+                if isinstance(port, SerialPath)
+                else [(port.host, port.port), *port.reach.others]
+            )
+            others = [ports.setdefault(place, line.name) for place in places]
+            if other := next((one for one in others if one != line.name), ""):
                 self.mistakes.add(
                     ("lines", line.name, "port"),
                     f"line {other} has this port already: one port is one line, "

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path as FilePath
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.settings.model import LineSection
+from gateway.config.settings.model import ConnectionSection, LineSection
 from gateway.config.settings.zenoh_records import tls_files
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.protocols.unsolicited import Unsolicited
@@ -13,6 +13,7 @@ from gateway.transport.port import (
     DeviceServer,
     ListenAddress,
     PortAddress,
+    Reach,
     Rfc2217Address,
     SerialPath,
     TcpAddress,
@@ -21,6 +22,8 @@ from gateway.transport.port import (
 from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
 LONGEST_CONNECT_DELAY = 10.0  # seconds
+LONGEST_KEEPALIVE = 3600.0  # seconds
+MOST_ADDRESSES = 3  # of a device server, besides the port
 
 
 def port_of(line: LineSection, folder: FilePath, path: Path, mistakes: Mistakes) -> PortAddress:
@@ -31,6 +34,13 @@ def port_of(line: LineSection, folder: FilePath, path: Path, mistakes: Mistakes)
         tls = tls_files(line.tls.record(), folder, (*path, "tls"), mistakes)
     if isinstance(port, TcpAddress) and port.tls is not None and tls is not None:
         port = replace(port, tls=tls)
+    if line.connection is not None:
+        reach = _reach(line.connection, path, mistakes)
+        if isinstance(port, TcpAddress | Rfc2217Address) and not line.serve:
+            port = replace(port, reach=reach)
+        else:
+            text = "only a port tcp://, tls:// or rfc2217:// that the gateway connects to has it"
+            mistakes.add((*path, "connection"), text)
     if not isinstance(port, ListenAddress):
         if own is not None:
             text = "the line waits for no device server: its port is not listen://host:port"
@@ -46,6 +56,16 @@ def port_of(line: LineSection, folder: FilePath, path: Path, mistakes: Mistakes)
         return replace(port, server=DeviceServer(name=name))
     words = (own.registration or b"", own.heartbeat or b"")
     return replace(port, server=DeviceServer(*words, own.allow or (), name))
+
+
+def _reach(own: ConnectionSection, path: Path, mistakes: Mistakes) -> Reach:
+    if not 1 <= own.keepalive <= LONGEST_KEEPALIVE:
+        text = "the system asks after 1s to 1h of silence: write 20s"
+        mistakes.add((*path, "connection", "keepalive"), text)
+    if len(own.also) > MOST_ADDRESSES:
+        text = f"at most {MOST_ADDRESSES} more addresses: each gets its share of 5 s"
+        mistakes.add((*path, "connection", "also"), text)
+    return Reach(tuple(own.also), own.bind, own.keepalive)
 
 
 def check_device_servers(lines: Mapping[str, PortAddress], mistakes: Mistakes) -> None:

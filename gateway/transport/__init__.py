@@ -17,6 +17,7 @@ from gateway.transport.port import (
     SerialSettings,
     SimulatorAddress,
     TcpAddress,
+    named,
     parse_port,
 )
 
@@ -100,4 +101,4 @@ def _name(where: ModemAddress) -> str:
         case SerialPath(path):
             return path
         case TcpAddress(host, port) | Rfc2217Address(host, port):
-            return f"{host}:{port}"
+            return named(host, port)

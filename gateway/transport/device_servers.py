@@ -22,6 +22,7 @@ from gateway.transport.port import (
     ListenAddress,
     Receiver,
     TlsConfig,
+    named,
 )
 from gateway.transport.stream import Allowance, StreamPort
 from gateway.transport.tls import ServerFiles, names_of
@@ -136,7 +137,7 @@ class _Door:
 
     @property
     def name(self) -> str:
-        return f"{self.where[0]}:{self.where[1]}"
+        return named(*self.where)
 
     async def connection(self, server: DeviceServer, timeout: float) -> _Connection:
         """Returns its connection, or waits for it. Raises `LineDown`."""

@@ -9,7 +9,7 @@ import structlog
 
 from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
-from gateway.transport.port import Port, Receiver, TcpAddress
+from gateway.transport.port import Port, Receiver, TcpAddress, named
 from gateway.transport.stream import StreamPort
 from gateway.transport.tcp import configure
 from gateway.transport.tls import ServerFiles, not_begun
@@ -33,7 +33,7 @@ class Listener:
     """A port of this machine that other programs connect to."""
 
     def __init__(self, where: TcpAddress) -> None:
-        self._name = f"{where.host}:{where.port}"
+        self._name = named(where.host, where.port)
         self._where = where
         self._socket: socket.socket | None = None
         self._ports: set[_Accepted] = set()
@@ -141,7 +141,7 @@ async def listening(host: str, port: int, backlog: int) -> socket.socket:
         family, _, _, _, address = found[0]
         made = socket.create_server(address[:2], family=family, backlog=backlog)
     except (OSError, UnicodeError, OverflowError) as error:
-        raise line_down(f"{host}:{port}", error) from error
+        raise line_down(named(host, port), error) from error
     made.setblocking(False)
     return made
 

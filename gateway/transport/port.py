@@ -60,6 +60,18 @@ class TlsConfig:
             raise ConfigError("mutual needs ca, certificate and key")
 
 
+KEEPALIVE = 20.0  # seconds of silence until the system asks if the other side is there
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How a connection is made. `others`: more addresses of the same device server."""
+
+    others: tuple[tuple[str, int], ...] = ()
+    bind: str = ""  # the address of this computer; empty: the system chooses
+    keepalive: float = KEEPALIVE  # seconds
+
+
 @dataclass(frozen=True, slots=True)
 class TcpAddress:
     """A device server in raw mode, or a device with a network port: `tcp://host:port`, and
@@ -68,6 +80,7 @@ class TcpAddress:
     host: str
     port: int
     tls: TlsConfig | None = None
+    reach: Reach = Reach()
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +89,12 @@ class Rfc2217Address:
 
     host: str
     port: int
+    reach: Reach = Reach()
+
+
+def named(host: str, port: int) -> str:
+    """Returns an address as people write it: `10.0.0.7:502`, `[fe80::1]:502`."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def is_loopback(host: str) -> bool:

@@ -44,7 +44,7 @@ async def open_rfc2217(
     loop = asyncio.get_running_loop()
     begin = loop.time()
     port = Rfc2217Port(receiver)
-    address = TcpAddress(where.host, where.port)
+    address = TcpAddress(where.host, where.port, reach=where.reach)
     tcp = await open_tcp(address, port, timeout=timeout, baudrate=settings.baudrate)
     try:
         left = max(begin + timeout - loop.time(), LONGEST_WAIT)

@@ -1,57 +1,80 @@
 """Opens TCP connections that detect a dead peer within a minute."""
 
 import asyncio
+import errno
 import socket
 
 from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
-from gateway.transport.port import Receiver, TcpAddress
+from gateway.transport.port import KEEPALIVE, Reach, Receiver, TcpAddress, named
 from gateway.transport.stream import StreamPort
 from gateway.transport.tls import begin_tls, make_context
 
-# A peer without power sends nothing. After 20 s of silence the system sends a keep-alive three
-# times, every 10 s. Sent data must be acknowledged within 50 s, or the line is down. The names
-# differ between systems: names that this system lacks are left out.
-KEEPALIVE = {
-    "TCP_KEEPIDLE": 20,  # seconds
-    "TCP_KEEPALIVE": 20,  # the name on macOS
-    "TCP_KEEPINTVL": 10,  # seconds
-    "TCP_KEEPCNT": 3,
-    "TCP_USER_TIMEOUT": 50_000,  # milliseconds; Linux only
+# A peer without power sends nothing. After the silence of `keepalive` the system sends three times,
+# and waits half of it each time. Sent data must be acknowledged as soon, or the line is down. The
+# names differ between systems: names that this system lacks are left out.
+_OPTIONS = {
+    "TCP_KEEPIDLE": 1.0,  # of `keepalive`, in seconds
+    "TCP_KEEPALIVE": 1.0,  # the name on macOS
+    "TCP_KEEPINTVL": 0.5,
+    "TCP_USER_TIMEOUT": 2500.0,  # in milliseconds; Linux only
 }
+_TRIES = 3
 
 
 async def open_tcp(
     where: TcpAddress, receiver: Receiver, *, timeout: float = 5.0, baudrate: int = 0
 ) -> StreamPort:
-    """Connects to a device server or network device. Raises `LineDown`.
+    """Connects to a device server or network device, by the first of its addresses that works.
+    Raises `LineDown`.
 
-    `baudrate`: of the wire behind it; 0: not known.
+    `baudrate`: of the wire behind it; 0: not known. Each address gets its share of the time.
     """
-    name, loop = f"{where.host}:{where.port}", asyncio.get_running_loop()
-    port, by = StreamPort(name, receiver, baudrate), loop.time() + timeout
-    tls, context = where.tls, None
-    try:
-        async with asyncio.timeout_at(by):
-            if tls is not None:
-                context = await asyncio.to_thread(make_context, tls, serves=False)
-            transport, _ = await loop.create_connection(lambda: port, where.host, where.port)
-        configure(transport.get_extra_info("socket"))
-        if tls is not None and context is not None:
-            await begin_tls(port, context, within=by - loop.time(), host=tls.name or where.host)
-        port.ready()
-    # UnicodeError: an invalid host name, for example with an empty label.
-    except (OSError, UnicodeError, LineDown) as error:
-        await port.close()
-        raise line_down(name, error) from error
-    return port
+    by, failed = asyncio.get_running_loop().time() + timeout, list[str]()
+    places = ((where.host, where.port), *where.reach.others)
+    for left, place in zip(range(len(places), 0, -1), places, strict=True):
+        share = (by - asyncio.get_running_loop().time()) / left
+        port = StreamPort(named(*place), receiver, baudrate)
+        try:
+            await _connect(port, place, where, share)
+        # UnicodeError: an invalid host name, for example with an empty label.
+        except (OSError, UnicodeError, LineDown) as error:
+            await port.close()
+            failed.append(str(line_down(port.name, error, _sentences(where.reach))))
+            cause: Exception = error
+        else:
+            return port
+    raise LineDown("; ".join(failed)) from cause
 
 
-def configure(connection: socket.socket) -> None:
+async def _connect(
+    port: StreamPort, place: tuple[str, int], where: TcpAddress, timeout: float
+) -> None:
+    loop, tls, context = asyncio.get_running_loop(), where.tls, None
+    by, bind = loop.time() + timeout, where.reach.bind
+    async with asyncio.timeout_at(by):
+        if tls is not None:
+            context = await asyncio.to_thread(make_context, tls, serves=False)
+        transport, _ = await loop.create_connection(
+            lambda: port, *place, local_addr=(bind, 0) if bind else None
+        )
+    configure(transport.get_extra_info("socket"), where.reach.keepalive)
+    if tls is not None and context is not None:
+        await begin_tls(port, context, within=by - loop.time(), host=tls.name or place[0])
+    port.ready()
+
+
+def _sentences(reach: Reach) -> dict[int, str]:
+    wrong = f"{reach.bind} is not an address of this computer: `bind`"
+    return {errno.EADDRNOTAVAIL: wrong} if reach.bind else {}
+
+
+def configure(connection: socket.socket, keepalive: float = KEEPALIVE) -> None:
     """Sends without delay and detects a dead peer. Raises `OSError`."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in KEEPALIVE.items():
+    values = {name: max(1, round(factor * keepalive)) for name, factor in _OPTIONS.items()}
+    for name, value in {**values, "TCP_KEEPCNT": _TRIES}.items():
         option = getattr(socket, name, None)
         if option is not None:
             connection.setsockopt(socket.IPPROTO_TCP, option, value)

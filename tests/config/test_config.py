@@ -340,8 +340,8 @@ LINES = [
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, origin, echo, rs485, device_server, tls, serve, request_gap, "
-        "listen_only, modem, connect_delay, close_after, defaults or devices",
+        "use port, baudrate, format, origin, echo, rs485, device_server, tls, connection, serve, "
+        "request_gap, listen_only, modem, connect_delay, close_after, defaults or devices",
     ),
     bad(
         "negative baud rate",

@@ -19,14 +19,6 @@ from tests.conftest import forbidden, needs
 from tests.e2e.processes import PATIENCE, Program, station, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
-# The command itself; only how long a dead peer may go unnoticed is shorter.
-SHORT = "{'TCP_KEEPIDLE': 1, 'TCP_KEEPINTVL': 1, 'TCP_KEEPCNT': 1, 'TCP_USER_TIMEOUT': 3000}"
-RUN = f"""
-import gateway.transport.tcp as tcp
-tcp.KEEPALIVE = {SHORT}
-from gateway.cli.main import main
-main()
-"""
 PORT = 4001
 SPEED = "plant/mixer/speed"
 
@@ -90,11 +82,11 @@ async def test_a_peer_without_power_is_detected_and_comes_back(
         "speed": {"address": "D10", "publish": "always"},
         "recipe": {"address": "D500", "write": True},
     }
-    line = vigor_line(f"tcp://{cable.peer}:{PORT}", tags)
+    line = vigor_line(f"tcp://{cable.peer}:{PORT}", tags) | {"connection": {"keepalive": "1s"}}
     config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line})
     with (
         cable.station() as plc,
-        Program(sys.executable, "-c", RUN, "run", config) as service,
+        Program(sys.executable, "-m", "gateway", "run", config) as service,
     ):
         plc.tell("set 1 D 10 5")
         await asyncio.to_thread(service.says, "Zenoh session ready")

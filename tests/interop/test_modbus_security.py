@@ -98,6 +98,18 @@ async def test_the_role_in_the_certificate_of_a_master_says_if_it_may_write(
     await asyncio.wait([task])
 
 
+def test_one_address_is_one_line_whatever_its_scheme(tmp_path: Path) -> None:
+    device = {"protocol": "modbus-rtu", "station": 1, "tags": {"level": {"address": "holding:7"}}}
+    lines: dict[str, dict[str, Any]] = {
+        "hall": {"port": "tcp://a:502", "connection": {"also": ["b:502"]}},
+        "other": {"port": "rfc2217://b:502"},
+    }
+    for number, line in enumerate(lines.values()):
+        line["devices"] = {f"d{number}": device}
+    with pytest.raises(ConfigError, match="line hall has this port already"):
+        built({"lines": lines}, tmp_path)
+
+
 def test_only_the_extension_is_a_role(tmp_path: Path) -> None:
     plant = Authority(tmp_path)
 
@@ -137,9 +149,14 @@ def test_only_the_extension_is_a_role(tmp_path: Path) -> None:
             "it needs `mutual: true`",
         ),
         ("tls://a:802", {"tls": {"ca": "no.pem"}}, "ca: there is no file"),
+        ("tcp://a:502", {"connection": {"also": ["[::1]:5", "b:6"], "bind": "::1"}}, None),
+        ("listen://a:502", {"connection": {}}, "only a port tcp://, tls:// or rfc2217:// that"),
+        ("tcp://a:502", {"connection": {"keepalive": "2h"}}, "the system asks after 1s to 1h"),
+        ("tcp://a:502", {"connection": {"bind": "eth0"}}, "'eth0' is no address of this computer"),
+        ("tcp://a:502", {"connection": {"also": ["b:1"] * 4}}, "at most 3 more addresses"),
     ],
 )
-def test_settings_of_certificates(
+def test_settings_of_connections(
     tmp_path: Path, port: str, line: dict[str, Any], says: str | None
 ) -> None:
     Authority(tmp_path).issue("gateway")

@@ -11,6 +11,7 @@ import pytest
 from gateway.errors import LineDown
 from gateway.transport import Port, SerialSettings, TcpAddress, open_port
 from gateway.transport.os_errors import line_down
+from gateway.transport.port import Reach
 from gateway.transport.stream import LONGEST_CLOSE, StreamPort
 from tests.transport.ends import PATIENCE, RecordingReceiver, free_port, listening
 from tests.vectors import vectors
@@ -204,6 +205,53 @@ async def test_closing_does_not_wait_for_a_peer_that_accepts_no_data() -> None:
         arrived = 1
         while arrived:  # the buffer of the port is not sent after the close
             arrived = len(await loop.sock_recv(peer, 1_000_000))
+
+
+async def test_the_addresses_of_a_device_server_are_tried_in_turn() -> None:
+    """Refused, silent (its backlog is full), then one that answers; each gets its share of time."""
+    receiver, loop, refuses = RecordingReceiver(), asyncio.get_running_loop(), free_port()
+    with listening(backlog=0) as silent, listening() as server:
+        full = [socket.socket() for _ in range(2)]
+        for one in full:
+            one.setblocking(False)
+            one.connect_ex(silent.getsockname())
+        places = (silent.getsockname(), server.getsockname())
+        where = TcpAddress("127.0.0.1", refuses, reach=Reach(places))
+        accepting = asyncio.create_task(loop.sock_accept(server))
+        port = await open_port(where, ANY, receiver, timeout=1.0)
+        peer, _ = await accepting
+        with peer:
+            port.write(REQUEST)
+            assert await loop.sock_recv(peer, 1000) == REQUEST
+            await port.close()
+        where = TcpAddress("127.0.0.1", refuses, reach=Reach(places[:1]))
+        with pytest.raises(LineDown) as caught:
+            await open_port(where, ANY, receiver, timeout=0.2)
+        for one in full:
+            one.close()
+    says = f"127.0.0.1:{refuses}: connection refused; 127.0.0.1:{places[0][1]}: no answer"
+    assert str(caught.value) == says
+
+
+async def test_the_connection_comes_from_the_address_that_is_bound() -> None:
+    loop = asyncio.get_running_loop()
+    with listening() as server:
+        accepting = asyncio.create_task(loop.sock_accept(server))
+        where = TcpAddress("127.0.0.1", server.getsockname()[1], reach=Reach(bind="127.0.0.9"))
+        port = await open_port(where, ANY, RecordingReceiver())
+        peer, address = await accepting
+        assert address[0] == "127.0.0.9"
+        peer.close()
+        await port.close()
+        where = TcpAddress("127.0.0.1", server.getsockname()[1], reach=Reach(bind="192.0.2.1"))
+        with pytest.raises(LineDown, match="is not an address of this computer: `bind`"):
+            await open_port(where, ANY, RecordingReceiver())
+
+
+async def test_an_address_of_ipv6_is_written_with_brackets() -> None:
+    where = TcpAddress("::1", free_port())
+    with pytest.raises(LineDown, match=rf"^\[::1\]:{where.port}: "):
+        await open_port(where, ANY, RecordingReceiver())
 
 
 async def test_a_dead_peer_is_detected_within_a_minute_and_nothing_is_buffered() -> None:

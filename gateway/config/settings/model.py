@@ -29,9 +29,10 @@ from gateway.config.settings.setting_types import (
     Parsed,
     Port,
     Text,
+    WebAddress,
 )
 from gateway.tags.tag import NotReal
-from gateway.transport.port import TlsConfig
+from gateway.transport.port import KEEPALIVE, TlsConfig
 
 
 class WritersSection(Section):
@@ -101,6 +102,17 @@ class DeviceServerSection(Section):
     """The addresses that may connect, such as [10.1.0.0/16]; left out: all."""
 
 
+class ConnectionSection(Section):
+    """How a connection to a device server is made: docs/connections.md."""
+
+    also: list[WebAddress] = []
+    """More addresses of the same device server, such as 10.1.0.7:4001: tried in turn."""
+    bind: Annotated[str, Parsed(parsers.local_address, {"type": "string"})] = ""
+    """The address of this computer to connect from; left out: the system chooses."""
+    keepalive: Interval = KEEPALIVE
+    """Silence after which the system asks if the device server is there; 1s to 1h."""
+
+
 class LineTlsSection(TlsSection):
     """TLS of a port `tls://host:port` or `listen://host:port`: docs/connections.md."""
 
@@ -135,6 +147,8 @@ class LineSection(Section):
     """Of a port `listen://…`: which device server this line waits for."""
     tls: LineTlsSection | None = None
     """Of a port `tls://…` or `listen://…`: its certificates."""
+    connection: ConnectionSection | None = None
+    """Of a port tcp://, tls:// or rfc2217://: how the connection is made."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
     request_gap: Duration | None = None

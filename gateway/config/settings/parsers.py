@@ -7,7 +7,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable
-from ipaddress import IPv4Network, IPv6Network, ip_network
+from ipaddress import IPv4Network, IPv6Network, ip_address, ip_network
 from pathlib import Path
 from typing import Literal
 
@@ -174,6 +174,14 @@ def web_address(text: object) -> tuple[str, int]:
     if match is None or not 1 <= int(match[2]) <= 65535:
         raise ConfigError(f"{shown(text)} is no address to listen on: write 127.0.0.1:8080")
     return match[1].strip("[]"), int(match[2])
+
+
+def local_address(text: object) -> str:
+    """Parses an address of this computer, such as `10.1.0.5`."""
+    try:
+        return str(ip_address(text if isinstance(text, str) else ""))
+    except ValueError:
+        raise ConfigError(f"{shown(text)} is no address of this computer: write 10.1.0.5") from None
 
 
 def origin(text: object) -> str:

@@ -22,7 +22,7 @@ from gateway.stations.served.echo import Echo
 from gateway.stations.served.registry import answerer, is_numbered
 from gateway.stations.store import Store
 from gateway.transport.listen import Listener
-from gateway.transport.port import allows
+from gateway.transport.port import allows, named
 
 log = structlog.get_logger("gateway.line")
 T = TypeVar("T")
@@ -114,7 +114,7 @@ class OpenDoor:
         settings = self.settings
         return {
             "line": settings.line,
-            "listen": f"{settings.where.host}:{settings.where.port}",
+            "listen": named(settings.where.host, settings.where.port),
             "protocol": settings.protocol,
             "trouble": self._trouble,
             "most": settings.most,

@@ -7,7 +7,7 @@ from typing import Any
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress, WebOrigin
-from gateway.transport.port import is_loopback
+from gateway.transport.port import is_loopback, named
 
 
 class WebTlsSection(Section):
@@ -46,8 +46,7 @@ class WebSection(Section):
 
     @property
     def url(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{'http' if self.tls is None else 'https'}://{host}:{self.port}/"
+        return f"{'http' if self.tls is None else 'https'}://{named(*self.listen)}/"
 
     @property
     def is_local(self) -> bool:
