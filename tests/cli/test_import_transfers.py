@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from gateway.cli.sheets.communication_table import import_transfers
 from gateway.cli.sheets.export import export
-from gateway.cli.sheets.import_command import import_transfers
 from gateway.config import load
 from gateway.errors import ConfigError
 from tests.sheets.test_link_table import LINK, LINK_REGISTERS, MBUS, registers
@@ -33,6 +33,8 @@ def written(folder: Path, table: str, devices: str, more: str = "") -> tuple[Pat
 def test_the_manuals_easy_link_example_becomes_two_rows(tmp_path: Path, table: str) -> None:
     sheet, file = written(tmp_path, table, VIGOR)
     before = file.read_text()
+    import_transfers(sheet, file, "plc", dry_run=True)
+    assert [file.read_text(), len([*tmp_path.iterdir()])] == [before, 2]
     import_transfers(sheet, file, "plc")
     assert file.read_text().startswith(before)
     assert [rule.text for rule in load(file).transfers] == [

@@ -13,7 +13,8 @@ from gateway.cli.config.check import check, size
 from gateway.cli.line import scan as scanning
 from gateway.cli.line.scan import Found
 from gateway.cli.line.scan_command import BaudOption, FormatOption, TimeoutOption, scanned
-from gateway.cli.sheets.import_command import add_tags, write_new
+from gateway.cli.sheets.import_command import add_tags
+from gateway.cli.sheets.text_file import write_new
 from gateway.cli.terminal import err
 from gateway.config import load
 from gateway.config.messages import one_of

@@ -7,4 +7,5 @@ configuration checks those.
 
 from gateway.config.sheets import link_table
 from gateway.config.sheets.grid import Grid, neutral, read_grid
-from gateway.config.sheets.sheet import Sheet, SheetMistake, adapted, devices_in, read_sheet
+from gateway.config.sheets.layout import adapted, devices_in
+from gateway.config.sheets.sheet import Sheet, SheetMistake, read_sheet

@@ -49,10 +49,11 @@ def words(section: str) -> dict[str, Any]:
     return {word: value for value, row in rows for word in row.split(", ")}
 
 
-def check(text: str) -> None:
-    """Raises `ConfigError` for the error of a formula."""
+def check(text: str) -> str:
+    """Returns a text. Raises `ConfigError` for the error of a formula."""
     if _SPREADSHEET_ERROR.match(text):
         raise ConfigError(f"{text} is the error of a formula: correct it in the spreadsheet")
+    return text
 
 
 def decimal_mark(numbers: Iterable[str]) -> str | None:

@@ -2,14 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gateway.config.sheets import cells
-from gateway.config.sheets.columns import Column, Columns, columns_of, titles_in, unusable
-from gateway.config.sheets.grid import HEADER_ROWS, Grid, Row
+from gateway.config.sheets.columns import Column, Columns, columns_of, unusable
+from gateway.config.sheets.grid import Grid, Row
+from gateway.config.sheets.layout import parts
 from gateway.errors import ConfigError
 
 _NUMBERS = ("scale", "offset", "min", "max", "raw_low", "raw_high", "scaled_low", "scaled_high")
@@ -24,6 +24,8 @@ _READERS: dict[str, Callable[[str], object]] = {
 }
 _SCALINGS = ("", "none", "no", "keine", "linear")
 _KEPT = 3  # examples in a note
+_OF_OTHERS = "tags of other devices"
+_WORD = re.compile(r"[^\W\d]{2}")
 _ASSIGNED = ("<auto>", "auto", "<자동>")  # an address that is only known in the PLC's program
 
 
@@ -55,79 +57,20 @@ def read_sheet(
     column of their own name; `parse` turns their cells into data, and raises `ConfigError`.
     Raises `ConfigError` where the file has no titles.
     """
-    header = _header(grid.rows)
+    header, rows = parts(grid)
     columns = columns_of(header.cells, others)
     reader = _Reader(columns, grid.decimal, header.number, others, parse)
     reader.sheet.notes += grid.project.notes if grid.project else []
-    reader.check_columns()
-    rows = [row for row in grid.rows if row.number > header.number and _has_tag(row)]
-    reader.learn(rows)
-    for row in rows:
-        reader.add(row, device)
+    reader.check_columns(rows)
+    found = [(row.number, reader.texts(row)) for row in rows]
+    reader.learn([texts for _, texts in found])
+    for row, texts in found:
+        reader.add(row, texts, device)
     reader.finish(device)
     return reader.sheet
 
 
-def devices_in(grid: Grid) -> list[str]:
-    """Returns the devices that a sheet names, in their order. Raises `ConfigError`."""
-    header = _header(grid.rows)
-    column = columns_of(header.cells, ()).by_setting.get("device")
-    if column is None:
-        return []
-    rows = (row for row in grid.rows if row.number > header.number and _has_tag(row))
-    return list(dict.fromkeys(cells.name(cell) for row in rows if (cell := _at(row, column))))
-
-
-def adapted(grid: Grid, titles: Mapping[str, str], prefixes: Mapping[str, str]) -> Grid:
-    """Returns the sheet with settings as titles, and other beginnings of addresses.
-
-    `titles`: the title of each such setting. Raises `ConfigError` where no row has them all.
-    """
-    rows, settings = list(grid.rows), {title.casefold(): name for name, title in titles.items()}
-    if titles:
-        for at, row in enumerate(rows[:HEADER_ROWS]):
-            if settings.keys() <= {cell.casefold() for cell in row.cells}:
-                rows[at] = Row(row.number, [_title(cell, settings) for cell in row.cells])
-                break
-        else:
-            raise ConfigError(f"no row has the titles {', '.join(titles.values())}")
-    if prefixes:
-        header = _header(rows)
-        column = columns_of(header.cells, ()).by_setting.get("address")
-        for row in rows:
-            if column and row.number > header.number and column.index < len(row.cells):
-                text = row.cells[column.index]
-                old = max((one for one in prefixes if text.startswith(one)), key=len, default="")
-                row.cells[column.index] = prefixes.get(old, "") + text.removeprefix(old)
-    return grid._replace(rows=rows)
-
-
-def _title(cell: str, settings: Mapping[str, str]) -> str:
-    """Returns a title; another column with the meaning of a chosen one loses its own."""
-    if cell.casefold() in settings:
-        return settings[cell.casefold()]
-    meaning = columns_of([cell], ()).by_setting
-    return f"not used: {cell}" if meaning.keys() & set(settings.values()) else cell
-
-
-def _header(rows: Sequence[Row]) -> Row:
-    first = [row for row in rows[:HEADER_ROWS] if row.cells]
-    if not first:
-        raise ConfigError("the sheet is empty: its first row has titles, such as Name and Address")
-    best = max(first, key=lambda row: titles_in(row.cells))
-    if not titles_in(best.cells):
-        seen = ", ".join(cell for cell in first[0].cells if cell)[:80]
-        raise ConfigError(
-            "no row with titles of columns: the first row needs at least Name and Address, "
-            f"as `Name;Address;Type;Unit;Scale`. Row {first[0].number} has: {seen}"
-        )
-    return best
-
-
-def _has_tag(row: Row) -> bool:
-    """Returns False for empty rows, and rows that begin with # or //."""
-    first = next(filter(None, row.cells), "")
-    return bool(first) and not first.startswith(("# ", "//")) and first != "#"
+Texts = dict[str, str]  # the cells of a row that are not empty, by setting
 
 
 @dataclass(slots=True)
@@ -142,214 +85,173 @@ class _Reader:
     left: Counter[str] = field(default_factory=Counter)  # rows of tags that need no address
     devices: set[str] = field(default_factory=set)
 
-    def check_columns(self) -> None:
-        known = self.columns.by_setting
+    def texts(self, row: Row) -> Texts:
+        cells_, known = row.cells, self.columns.by_setting.items()
+        return {
+            setting: text
+            for setting, column in known
+            if column.index < len(cells_) and (text := cells_[column.index])
+        }
+
+    def check_columns(self, rows: Sequence[Row]) -> None:
+        known, unused = self.columns.by_setting, self.columns.unused
         for index, what in self.columns.mistakes:
-            self._mistake(self.header, what, Column("", "title", index).place)
+            self._mistake(self.header, what, Column("", "title", index))
         if "address" not in known:
             titles = ", ".join(column.title for column in known.values())
             self._mistake(self.header, f"no column Address; the titles are {titles}")
         if "name" not in known and "description" not in known:
             self._mistake(self.header, "no column Name, and no Comment to make names of")
+        # Without a column of names, one that looks like names must not be left out.
+        for index, title in () if "name" in known else unused.items():
+            found = {row.cells[index] for row in rows if index < len(row.cells)}
+            if sum(bool(_WORD.search(text)) for text in found) == len(rows) > 1:
+                what = f"names? Then add --columns name={title}; else delete the column"
+                self._mistake(self.header, what, Column("", title, index))
         self.sheet.columns = {setting: column.place for setting, column in known.items()}
         for part, whole in _PART_OF.items():
             if whole not in known and part in known:
                 self.sheet.columns[whole] = known[part].place
-        if self.columns.unused:
-            self.sheet.notes.append(f"columns not used: {', '.join(self.columns.unused.values())}")
+        if unused:
+            self.sheet.notes.append(f"columns not used: {', '.join(unused.values())}")
 
-    @property
-    def _named(self) -> bool:
-        """True where each row needs a name; labels may be empty."""
-        return "name" in self.columns.by_setting and not self.columns.of_labels
-
-    def _check_names(self, rows: Sequence[Row]) -> None:
-        """Without a column of names, one that looks like names must not be left out."""
-        known = self.columns.by_setting
-        for index, title in () if "name" in known else self.columns.unused.items():
-            found = [row.cells[index] for row in rows if index < len(row.cells)]
-            texts = {text for text in found if re.search(r"[^\W\d]{2}", text)}
-            if len(texts) == len(rows) > 1:
-                what = f"names? Then add --columns name={title}; else delete the column"
-                self._mistake(self.header, what, Column("", title, index).place)
-
-    def learn(self, rows: Sequence[Row]) -> None:
+    def learn(self, rows: Sequence[Texts]) -> None:
         """Finds what only all rows together tell: the decimal mark, and the devices."""
-        found = (self._cell(row, setting) for row in rows for setting in _NUMBERS)
-        self.decimal = self.decimal or cells.decimal_mark(found)
-        self._check_names(rows)
+        numbers = (texts[setting] for texts in rows for setting in _NUMBERS if setting in texts)
+        self.decimal = self.decimal or cells.decimal_mark(numbers)
         for setting in cells.data("words.yaml")["unusable"]:
-            if why := unusable(setting, {self._cell(row, setting) for row in rows}):
-                self._mistake(self.header, why, self._place(setting))
-        self.devices = {whose for row in rows if (whose := self._cell(row, "device"))}
+            if why := unusable(setting, {texts.get(setting, "") for texts in rows}):
+                self._mistake(self.header, why, setting)
+        self.devices = {texts["device"] for texts in rows if "device" in texts}
 
-    def add(self, row: Row, device: str) -> None:
+    def add(self, row: int, texts: Texts, device: str) -> None:
         """Adds the tag of a row, or its mistakes."""
-        whose = self._cell(row, "device")
-        if not whose and self.devices:
-            self._mistake(row.number, "no device, but other rows have one", self._place("device"))
-        if whose and cells.name(whose) != device:
+        if why := self._left_out(row, texts, device):
+            self.left[why] += 1
             return
-        if self._cell(row, "computed"):
-            self.left["computed tags left out: write them into the file"] += 1
-            return
-        address = self._cell(row, "address").casefold()
-        if address in _ASSIGNED or (self.columns.of_labels and not address):
-            self.left["tags left out: the PLC's program chose their addresses itself"] += 1
-            return
-        row = self._without_errors(row)
-        settings = dict(self._settings(row))
-        name = self._name(row, settings)
-        for problem in self._missing(row, name):
-            self._mistake(row.number, problem)
+        for setting, text in list(texts.items()):
+            if self._read(row, setting, cells.check, text) is None:
+                del texts[setting]  # the error of a formula
+        settings = self._settings(row, texts)
+        name = self._name(texts, settings)
+        if "address" in self.columns.by_setting and "address" not in texts:
+            self._mistake(row, "no address: fill it in, or begin a row that is no tag with #")
+        if not name and self._named:
+            self._mistake(row, "no name")
         if "address" not in settings:
             return
         if name in self.sheet.tags:
-            other = self.sheet.rows[name]
-            self._mistake(row.number, f"{name} is in row {other} already", self._place("name"))
+            self._mistake(row, f"{name} is in row {self.sheet.rows[name]} already", "name")
         if not name or name in self.sheet.tags:
-            name = f"{name}_row_{row.number}"  # its other mistakes are reported too
+            name = f"{name}_row_{row}"  # its other mistakes are reported too
         self.sheet.tags[name] = settings
-        self.sheet.rows[name] = row.number
+        self.sheet.rows[name] = row
 
-    def _without_errors(self, row: Row) -> Row:
-        """Notes the errors of formulas. Returns the row with empty cells in their place."""
-        found = list(row.cells)
-        for column in self.columns.by_setting.values():
-            try:
-                cells.check(_at(row, column))
-            except ConfigError as error:
-                self._mistake(row.number, str(error), column.place)
-                found[column.index] = ""
-        return Row(row.number, found)
+    def _left_out(self, row: int, texts: Texts, device: str) -> str:
+        """Returns why a row is no tag of the device; empty for a tag."""
+        whose, address = texts.get("device"), texts.get("address", "").casefold()
+        if not whose and self.devices:
+            self._mistake(row, "no device, but other rows have one", "device")
+        if whose and cells.name(whose) != device:
+            return _OF_OTHERS
+        if "computed" in texts:
+            return "computed tags left out: write them into the file"
+        if address in _ASSIGNED or (self.columns.of_labels and not address):
+            return "tags left out: the PLC's program chose their addresses itself"
+        return ""
 
     def finish(self, device: str) -> None:
+        del self.left[_OF_OTHERS]
         self.sheet.notes += [f"{count} {what}" for what, count in self.left.items()]
         if self.renamed:
             examples = ", ".join(self.renamed[:_KEPT])
             more = f" and {len(self.renamed) - _KEPT} more" if len(self.renamed) > _KEPT else ""
             self.sheet.notes.append(f"names changed to what a key can have: {examples}{more}")
         if not self.sheet.tags and not self.sheet.mistakes:
-            told = "no row below the titles has a tag"
-            if self.devices:
-                told = (
-                    f"no row is of device {device}: the sheet has {', '.join(sorted(self.devices))}"
-                )
-            self._mistake(self.header, told)
+            has = ", ".join(sorted(self.devices))
+            told = f"no row is of device {device}: the sheet has {has}" if has else ""
+            self._mistake(self.header, told or "no row below the titles has a tag")
 
-    def _missing(self, row: Row, name: str) -> Iterator[str]:
-        known = self.columns.by_setting
-        if "address" in known and not self._cell(row, "address"):
-            yield "no address: fill it in, or begin a row that is no tag with #"
-        if not name and self._named:
-            yield "no name"
+    @property
+    def _named(self) -> bool:
+        """True where each row needs a name; labels may be empty."""
+        return "name" in self.columns.by_setting and not self.columns.of_labels
 
-    def _name(self, row: Row, settings: dict[str, object]) -> str:
+    def _name(self, texts: Texts, settings: dict[str, object]) -> str:
         """Returns the name; without one, the comment or the address makes it."""
-        written = self._cell(row, "name")
-        if written:
-            name = cells.name(written)
-            if name != written:
+        if written := texts.get("name"):
+            if (name := cells.name(written)) != written:
                 self.renamed.append(f"{written} -> {name}")
                 settings.setdefault("description", written)
             return name
-        address = self._cell(row, "address")
         if self._named:
             return ""
-        comment = self._cell(row, "description")
-        name = cells.name(comment or address)
+        address = texts.get("address", "")
+        name = cells.name(texts.get("description") or address)
         return f"{name}_{cells.name(address)}" if name in self.sheet.tags else name
 
-    def _settings(self, row: Row) -> Iterator[tuple[str, object]]:
-        """Yields the settings of a tag that the row has."""
-        if address := self._cell(row, "address"):
-            bit = self._cell(row, "bit")
-            place = "bit" if bit else "address"
-            for _, spelt in self._one(row, place, partial(cells.address, address, bit)):
-                yield "address", spelt
-        for setting in ("unit", "description"):
-            if text := self._cell(row, setting):
-                yield setting, text
-        if text := self._cell(row, "type"):
-            length = self._cell(row, "length")
-            yield from self._one(row, "type", partial(cells.kind, text, length))
-        yield from self._scaling(row)
-        yield from self._write(row)
-        yield from self._timed(row)
-        readers = {**_READERS, **dict.fromkeys(self.others, self.parse)}
+    def _settings(self, row: int, texts: Texts) -> dict[str, object]:
+        """Returns the settings of a tag that the row has."""
+        bit, every = texts.get("bit", ""), self.columns.by_setting.get("every")
+        readers: dict[str, Callable[[str], object]] = {
+            "address": lambda text: cells.address(text, bit),
+            "unit": str,
+            "description": str,
+            "type": lambda text: cells.kind(text, texts.get("length", "")),
+            **dict.fromkeys(_NUMBERS, lambda text: cells.number(text, self.decimal)),
+            "verify": cells.flag,
+            "write": cells.access,
+            "every": lambda text: cells.duration(text, every.unit if every else ""),
+            "deadband": lambda text: cells.deadband(text, self.decimal),
+            **_READERS,
+            **dict.fromkeys(self.others, self.parse),
+        }
+        found: dict[str, Any] = {}
         for setting, read in readers.items():
-            if text := self._cell(row, setting):
-                yield from self._one(row, setting, partial(read, text))
+            if text := texts.get(setting):
+                place = "bit" if setting == "address" and bit else setting
+                if (value := self._read(row, place, read, text)) is not None:
+                    found[setting] = value
+        if why := _scale(found, texts.get("scaling", "").casefold()):
+            self._mistake(row, why[0], why[1])
+        rules = {name: found.pop(name) for name in ("min", "max", "verify") if name in found}
+        if found.get("write"):
+            found["write"] = rules or True
+        return found
 
-    def _timed(self, row: Row) -> Iterator[tuple[str, object]]:
-        if text := self._cell(row, "every"):
-            unit = self.columns.by_setting["every"].unit
-            yield from self._one(row, "every", partial(cells.duration, text, unit))
-        if band := self._cell(row, "deadband"):
-            yield from self._one(row, "deadband", partial(cells.deadband, band, self.decimal))
-
-    def _scaling(self, row: Row) -> Iterator[tuple[str, object]]:
-        values = dict(self._numbers(row, ("scale", "offset", *_RANGE)))
-        ends = [values.pop(setting) for setting in _RANGE if setting in values]
-        linear = self._cell(row, "scaling").casefold()
-        if linear not in _SCALINGS:
-            what = f"{linear} is no scaling: write linear, or the factor into a column Scale"
-            self._mistake(row.number, what, self._place("scaling"))
-        if (not ends and linear != "linear") or linear in ("none", "no", "keine"):
-            yield from values.items()
-            return
-        if len(ends) < 4 or values:
-            self._mistake(
-                row.number,
-                "a range needs its four ends, linear, and no scale beside it: "
-                "raw low, raw high, scaled low, scaled high",
-            )
-            return
-        raw_low, raw_high, low, high = ends
-        if raw_low == raw_high or low == high:
-            self._mistake(row.number, "the two ends of a range are equal")
-            return
-        scale = (high - low) / (raw_high - raw_low)
-        yield "scale", float(f"{scale:.15g}")
-        if offset := float(f"{low - raw_low * scale:.12g}"):
-            yield "offset", offset
-
-    def _write(self, row: Row) -> Iterator[tuple[str, object]]:
-        rules: dict[str, object] = dict(self._numbers(row, ("min", "max")))
-        if text := self._cell(row, "verify"):
-            rules |= self._one(row, "verify", partial(cells.flag, text))
-        if text := self._cell(row, "write"):
-            for _, write in self._one(row, "write", partial(cells.access, text)):
-                yield "write", (rules or True) if write else False
-
-    def _numbers(self, row: Row, settings: Sequence[str]) -> Iterator[tuple[str, int | float]]:
-        for setting in settings:
-            if text := self._cell(row, setting):
-                try:
-                    yield setting, cells.number(text, self.decimal)
-                except ConfigError as error:
-                    self._mistake(row.number, str(error), self._place(setting))
-
-    def _one(self, row: Row, setting: str, read: Callable[[], object]) -> list[tuple[str, object]]:
-        """Returns the setting with its value; nothing after a mistake, or without value."""
+    def _read(self, row: int, setting: str, read: Callable[[str], object], text: str) -> object:
+        """Returns the value of a cell; None after a mistake."""
         try:
-            value = read()
+            return read(text)
         except ConfigError as error:
-            self._mistake(row.number, str(error), self._place(setting))
-            return []
-        return [] if value is None else [(setting, value)]
+            self._mistake(row, str(error), setting)
+            return None
 
-    def _cell(self, row: Row, setting: str) -> str:
-        column = self.columns.by_setting.get(setting)
-        return _at(row, column) if column is not None else ""
-
-    def _place(self, setting: str) -> str:
-        column = self.columns.by_setting.get(setting)
-        return column.place if column is not None else ""
-
-    def _mistake(self, row: int, what: str, column: str = "") -> None:
-        self.sheet.mistakes.append(SheetMistake(row, column, what))
+    def _mistake(self, row: int, what: str, at: str | Column = "") -> None:
+        column = self.columns.by_setting.get(at) if isinstance(at, str) else at
+        self.sheet.mistakes.append(SheetMistake(row, column.place if column else "", what))
 
 
-def _at(row: Row, column: Column) -> str:
-    return row.cells[column.index] if column.index < len(row.cells) else ""
+def _scale(found: dict[str, Any], scaling: str) -> tuple[str, str] | None:
+    """Makes scale and offset of a range. Returns a mistake, and the setting it is in."""
+    ends = [found.pop(setting) for setting in _RANGE if setting in found]
+    if scaling not in _SCALINGS:
+        return (
+            f"{scaling} is no scaling: write linear, or the factor into a column Scale",
+            "scaling",
+        )
+    if (not ends and scaling != "linear") or scaling in ("none", "no", "keine"):
+        return None
+    if len(ends) < 4 or found.keys() & {"scale", "offset"}:
+        return (
+            "a range needs its four ends, linear, and no scale beside it: "
+            "raw low, raw high, scaled low, scaled high"
+        ), ""
+    raw_low, raw_high, low, high = ends
+    if raw_low == raw_high or low == high:
+        return "the two ends of a range are equal", ""
+    scale = (high - low) / (raw_high - raw_low)
+    found["scale"] = float(f"{scale:.15g}")
+    if offset := float(f"{low - raw_low * scale:.12g}"):
+        found["offset"] = offset
+    return None

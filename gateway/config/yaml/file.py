@@ -4,10 +4,8 @@ A key is always a text. A key written twice is a mistake, and so is anything tha
 to a Python program. A plain file is read as a stream; its tree is made for the lines of mistakes.
 """
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -17,20 +15,19 @@ from gateway import files
 from gateway.config.messages import ConfigErrors, Mistakes, Path, dotted
 from gateway.config.yaml.events import plain_data
 from gateway.config.yaml.scalars import scalar
+from gateway.config.yaml.syntax import DEEPEST, TOO_DEEP, line_of, syntax_mistake
 
 Entries = dict[str, tuple[yaml.Node, yaml.Node]]
 
 _KINDS = {yaml.ScalarNode: "str", yaml.SequenceNode: "seq", yaml.MappingNode: "map"}
 _TAGS = {kind: f"tag:yaml.org,2002:{name}" for kind, name in _KINDS.items()}
-_DEEPEST = 50  # levels; a configuration has less than ten
-_TOO_DEEP = f"more than {_DEEPEST} levels deep: look for a bracket or a dash too many"
 
 
 def _descend(loader: Any, parent: yaml.Node | None, _index: object) -> None:
     """Limits the depth: the reader is recursive, and some thousands of levels end in a crash."""
     loader.depth += 1
-    if loader.depth > _DEEPEST and parent is not None:
-        raise yaml.MarkedYAMLError(problem=_TOO_DEEP, problem_mark=parent.start_mark)
+    if loader.depth > DEEPEST and parent is not None:
+        raise yaml.MarkedYAMLError(problem=TOO_DEEP, problem_mark=parent.start_mark)
 
 
 def _ascend(loader: Any) -> None:
@@ -56,17 +53,6 @@ _LOADER: Any = type(
 # Limits the growth of a small file by aliases; ten times a gateway of 10,000 tags.
 _MOST_NODES = 2_000_000
 # Advice by words in the message of the reader; the first match counts.
-_REMEDIES = {
-    "escape character": "in double quotes a backslash begins an escape: use single quotes",
-    "quoted scalar": "close the quote",
-    "mapping values": "check indentation and colons of this line and the one before, "
-    "and put a text with `: ` in it in quotes",
-    "simple key": "check indentation and colons of this line and the one before",
-    "parsing a block": "check the indentation of this line and the one before",
-    "parsing a flow": "check commas and brackets, "
-    "and put a text with one of , : [ ] { } # in it in quotes",
-    "scanning": "put a text that begins with one of % @ ` & * ! | > in quotes",
-}
 _PLAIN_TAGS = set(_TAGS.values())
 
 
@@ -96,7 +82,7 @@ class YamlFile:
                 mark = node.start_mark
             else:
                 break
-        return _line(mark)
+        return line_of(mark)
 
     def at(self, line: int, path: Path) -> str:
         return f"{self.name}:{line}: {dotted(path) + ': ' if path else ''}"
@@ -118,9 +104,9 @@ class YamlFile:
 
     def _plain(self, node: yaml.Node, path: Path, mistakes: Mistakes) -> Any:
         self._nodes += 1
-        if self._nodes > _MOST_NODES or id(node) in self._open or len(path) > _DEEPEST:
+        if self._nodes > _MOST_NODES or id(node) in self._open or len(path) > DEEPEST:
             raise ConfigErrors(
-                [f"{self.name}:{_line(node.start_mark)}: its anchors repeat without end"]
+                [f"{self.name}:{line_of(node.start_mark)}: its anchors repeat without end"]
             )
         if node.tag not in _PLAIN_TAGS:
             mistakes.add(path, f"{node.tag!r} cannot be used here: write the value alone")
@@ -149,7 +135,7 @@ class YamlFile:
     def _check_keys(self, node: yaml.MappingNode, path: Path, mistakes: Mistakes) -> None:
         first: dict[str, int] = {}
         for key, _ in node.value:
-            line = _line(key.start_mark)
+            line = line_of(key.start_mark)
             if not isinstance(key, yaml.ScalarNode):
                 mistakes.add(path, f"the key in line {line} is no plain name")
             elif key.value in first and not _is_merge(key):
@@ -162,7 +148,7 @@ class YamlFile:
                 first[key.value] = line
 
     def _check_merges(self, node: yaml.MappingNode, path: Path, mistakes: Mistakes) -> None:
-        merges = [(_line(key.start_mark), value) for key, value in node.value if _is_merge(key)]
+        merges = [(line_of(key.start_mark), value) for key, value in node.value if _is_merge(key)]
         for line, value in merges:
             if not all(isinstance(one, yaml.MappingNode) for one in _parts(value)):
                 mistakes.add(
@@ -209,7 +195,7 @@ def compose(name: str, text: str) -> yaml.MappingNode:
     try:
         root = yaml.compose(text.encode(), Loader=_LOADER)
     except yaml.MarkedYAMLError as error:
-        raise ConfigErrors([_syntax(name, text, error)]) from None
+        raise ConfigErrors([syntax_mistake(name, text, error)]) from None
     except yaml.reader.ReaderError as error:
         line = text.encode()[: error.position].count(b"\n") + 1
         raise ConfigErrors([f"{name}:{line}: a control character: delete it"]) from None
@@ -217,7 +203,7 @@ def compose(name: str, text: str) -> yaml.MappingNode:
         raise ConfigErrors([f"{name}:1: the file is empty: it needs at least `lines:`"])
     if not isinstance(root, yaml.MappingNode):
         begin = "a file begins with names such as `gateway:` and `lines:`, each with a colon"
-        raise ConfigErrors([f"{name}:{_line(root.start_mark)}: no settings: {begin}"])
+        raise ConfigErrors([f"{name}:{line_of(root.start_mark)}: no settings: {begin}"])
     return root
 
 
@@ -239,61 +225,6 @@ def file_text(path: FilePath) -> str:
         raise ConfigErrors(
             [f"{path}:{line}: byte 0x{data[error.start]:02x} is no UTF-8: save the file as UTF-8"]
         ) from None
-
-
-def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
-    mark = error.problem_mark or error.context_mark
-    line = _line(mark) if mark else 1
-    problem = error.problem or "not understood"
-    rows = text.splitlines()
-    row = rows[line - 1] if line <= len(rows) else ""
-    if "\t" in row[: len(row) - len(row.lstrip(" \t-"))]:
-        return f"{name}:{line}: a tab: YAML is indented with spaces"
-    if problem == "but found another document":
-        return f"{name}:{line}: a second document (`---`): a configuration is one document"
-    if problem.startswith("found undefined alias"):
-        return f"{name}:{line}: an alias (*) without its anchor (&) before it"
-    if problem == _TOO_DEEP:
-        return f"{name}:{line}: {problem}"
-    if slip := next(filter(None, (_slip(rows, near) for near in _near(error, line))), None):
-        return f"{name}:{slip}"
-    context = error.context or ""
-    begun = ""
-    if error.context_mark and _line(error.context_mark) != line:
-        begun = f" that begins in line {_line(error.context_mark)}"
-    message = f"{context}{begun}, {problem}" if context else problem
-    remedies = (remedy for word, remedy in _REMEDIES.items() if word in message)
-    return f"{name}:{line}: no YAML: {': '.join([message, *islice(remedies, 1)])}"
-
-
-# One slip of the hand in a line that YAML does not understand, and what is right.
-_CONFLICT = re.compile(r"(<{7}|={7}|>{7}|\|{7})(?: |\Z)")
-_NO_SPACE = re.compile(r"\s*(?:- )?(\w[\w./-]{0,99}):([^\s/:].{0,99})\Z")
-_NO_COLON = re.compile(r"\s*(\w[\w./-]{0,99})(?: +=?| *\Z)([^:#]{0,99}|[\[{].{0,99})\Z")
-
-
-def _near(error: yaml.MarkedYAMLError, line: int) -> Iterator[int]:
-    """Yields the lines in which the cause of a mistake may be; the likely ones first."""
-    begun = _line(error.context_mark) if error.context_mark else line
-    yield from dict.fromkeys((begun, line - 1, line) if begun != line else (line - 1, line))
-
-
-def _slip(rows: list[str], line: int) -> str:
-    """Returns the line and what is wrong in it; empty for a line without a known slip."""
-    row = rows[line - 1] if 0 < line <= len(rows) else ""
-    if match := _CONFLICT.match(row):
-        return f"{line}: {match[1]} is a mark of a merge conflict: keep one of the two versions"
-    if "\xa0" in row:
-        return f"{line}: a no-break space, as web pages and Word have it: write a plain space"
-    if match := _NO_SPACE.match(row):
-        return f"{line}: no space after a colon: write {match[1]}: {match[2]}"
-    if match := _NO_COLON.match(row):
-        return f"{line}: no colon after {match[1]}: write {match[1]}: {match[2].strip()}".strip()
-    return ""
-
-
-def _line(mark: Any) -> int:
-    return int(mark.line) + 1
 
 
 def _is_merge(key: yaml.Node) -> bool:
