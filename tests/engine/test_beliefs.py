@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.beliefs import BELIEFS, Belief, table
 from gateway.engine.device.health import FORGOTTEN, State
 from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
 from gateway.engine.device.probe_pace import PROBE_SPREAD
@@ -22,6 +21,7 @@ from gateway.errors import Evidence, Garbled, NoReply, Refusal, Refused
 from gateway.line.channel import Echo
 from gateway.planning.planner import Block
 from gateway.tags import WriteRule
+from tests.engine.beliefs import BELIEFS, Belief, table
 from tests.engine.rig import SILENCE, Rig, bit_device, link_device, tcp_device
 from tests.sim.plant import device, make_tag
 
