@@ -42,5 +42,11 @@ def test_the_figures_are_within_their_limits() -> None:
     assert structure.fullest()[0] <= 20
 
 
+def test_each_long_and_each_short_module_has_its_reason() -> None:
+    page = (Path(structure.__file__).parents[1] / "docs/contributors/modules.md").read_text("utf-8")
+    explained = re.findall(r"^\| `(\S+\.py)` \| \w", page, re.MULTILINE)
+    assert explained == [name.split()[0] for name in structure.crowded()]
+
+
 def test_a_circle_is_found() -> None:
     assert set(structure.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
