@@ -2,13 +2,14 @@
 
 import io
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import pytest
 
 from gateway.config import load
-from gateway.config.sheets import read_grid, read_sheet
+from gateway.config.sheets import read_grid, read_sheet, workbooks
 from gateway.errors import ConfigError
 from gateway.stations.registry import station_of
 from gateway.values import Value
@@ -173,6 +174,27 @@ def test_a_mistake_in_a_project_names_its_tag(
     assert not (tmp_path / "plant.yaml").exists()
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"servermain.X": ' + 100_000 * "[",
+        "[[inputs.modbus]]\nx = " + 100_000 * "[",
+        "modbus:\n" + 300_000 * "- a: b\n",
+        "modbus: [*a]\n",
+    ],
+)
+def test_a_project_that_is_none_is_refused_soon(text: str) -> None:
+    with pytest.raises(ConfigError, match="this looks like a project of "):
+        read_grid(text.encode())
+
+
+def test_lists_in_lists_do_not_grow() -> None:
+    names = "abcdefghij"
+    grown = [f"{b}: &{b} [{','.join(9 * [f'*{a}'])}]" for a, b in pairwise(names)]
+    grid = read_grid("\n".join(["a: &a [x]", *grown, "modbus: *j", ""]).encode())
+    assert grid.rows == [(0, [])]
+
+
 def test_a_dry_run_checks_and_writes_nothing(command: Command, tmp_path: Path) -> None:
     plant = tmp_path / "plant.yaml"
     new = command("import", FOREIGN / "neuron.json", "--into", plant, "--dry-run")
@@ -233,15 +255,17 @@ def test_an_ods_file_has_rows_numbers_and_errors_of_formulas() -> None:
     assert (mistake.row, mistake.column) == (6, "column C (Faktor)")
 
 
-def test_a_workbook_that_grows_without_end_is_refused() -> None:
+def test_a_workbook_that_grows_without_end_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workbooks, "_MOST_ROWS", 200)
     full = "<table:table-cell><text:p>x</text:p></table:table-cell>"
     row = f'<table:table-row table:number-rows-repeated="9000000">{full}</table:table-row>'
-    with pytest.raises(ConfigError, match="more than 200000 rows"):
+    with pytest.raises(ConfigError, match="more than 200 rows"):
         read_grid(ods([["Name", "Address"]], row))
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("content.xml", b" " * 210_000_000)
-    with pytest.raises(ConfigError, match="more than 200 MB"):
+        archive.writestr("content.xml", b" " * 2_100_000)
+    monkeypatch.setattr(workbooks, "_MOST_BYTES", 2_000_000)
+    with pytest.raises(ConfigError, match="more than 2 MB"):
         read_grid(stream.getvalue())
 
 

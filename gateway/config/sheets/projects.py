@@ -18,6 +18,7 @@ from gateway.config.sheets import cells
 from gateway.errors import ConfigError
 
 _MOST_TAGS = 100_000
+_MOST_YAML = 2_000_000  # characters: some seconds
 _FIELD = re.compile(r"\{([^{}]+)\}")
 _COMMENT = re.compile(r"(?m)^\s*//.*$")
 _OF_LINE = ("connection", "port", "baudrate", "format", "protocol", "station", "base")
@@ -42,8 +43,12 @@ def read_project(text: str) -> Project | None:
     """Returns the project that the text of a file is; None for a sheet. Raises `ConfigError`."""
     for program, spec in cells.data("projects.yaml").items():
         if re.search(spec["mark"], text):
-            tree = _tree(program, spec.get("form", "json"), text)
-            return _Reader(program, spec).project(tree)
+            try:
+                tree = _tree(spec.get("form", "json"), text)
+                return _Reader(program, spec).project(tree)
+            except (ValueError, yaml.YAMLError, RecursionError) as error:
+                wrong = f"this looks like a project of {program}, but: {error}"
+                raise ConfigError(wrong) from None
     return None
 
 
@@ -54,15 +59,14 @@ class _Loader(yaml.CSafeLoader):
 _Loader.add_multi_constructor("!", lambda loader, tag, node: f"!{tag} {node.value}")
 
 
-def _tree(program: str, form: str, text: str) -> object:
-    try:
-        if form == "toml":
-            return tomllib.loads(text)
-        if form == "yaml":
-            return yaml.load(text, _Loader)  # noqa: S506  # a safe loader
-        return json.loads(_COMMENT.sub("", text))
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"this looks like a project of {program}, but: {error}") from None
+def _tree(form: str, text: str) -> object:
+    if form == "toml":
+        return tomllib.loads(text)
+    if form == "yaml":
+        if len(text) > _MOST_YAML:
+            raise ConfigError(f"it has more than {_MOST_YAML // 10**6} MB")
+        return yaml.load(text, _Loader)  # noqa: S506  # a safe loader
+    return json.loads(_COMMENT.sub("", text))
 
 
 def _text(value: object) -> str:
@@ -100,7 +104,8 @@ class _Reader:
         """Yields the fields of each tag, with those of all lists around it."""
         if isinstance(node, list):
             for one in node:
-                yield from self._walk(one, path, around)
+                if isinstance(one, dict):  # aliases of lists in lists could grow without end
+                    yield from self._walk(one, path, around)
         if not isinstance(node, dict):
             return
         level, *deeper = path
