@@ -210,6 +210,6 @@ def test_a_proof_needs_a_shape_that_no_unanswered_request_has(
     dev = device(words(0, 20))
     dev.health.unclear(NoReply("silence"), asked, 0.0, known=known)
     dev.health.unclear(NoReply("silence"), Span("D", 0, 20), 1.0, known=True)
-    assert dev.may_be_proven is proven
+    assert dev.may_be_proven(0.0) is proven
     dev.health.answered(resynced=True)
-    assert dev.may_be_proven
+    assert dev.may_be_proven(0.0)

@@ -7,7 +7,7 @@ import pytest
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.device.reply_shapes import SHOWN, WARY_FOR
+from gateway.engine.device.reply_shapes import LACKED_FOR, SHOWN, WARY_FOR
 from gateway.engine.forecast import forecast
 from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
 from gateway.engine.results.proofs import UNPROVEN
@@ -299,7 +299,7 @@ def rounds(rig: Rig, count: int, told_from: int = EVERY_REQUEST) -> list[int]:
     return proven
 
 
-PLACES = (base + n for base in (0, 1000, 2000, 3000) for n in range(12))
+PLACES = [base + n for base in (0, 1000, 2000, 3000) for n in range(12)]
 BLOCKS = ("D0", "D1000", "D2000", "D3000")
 
 
@@ -412,3 +412,24 @@ def test_a_read_of_an_old_plan_makes_no_value(waits: bool) -> None:
     else:
         rig.conclude(job, [7] * job.span.size)  # type: ignore[union-attr]
     assert not good(rig)
+
+
+def test_a_device_that_refuses_the_read_of_a_form_of_its_own_is_asked_for_others() -> None:
+    """A Vigor PLC of an old make refuses M0: each refusal costs more than half a second."""
+    rig = of_blocks(ModbusRtu(station=1), *(f"holding:{n}" for n in range(12)))
+    rig.now += 10.0
+    probe = reads(rig)[1]
+    assert probe.token == PROOF
+    rig.conclude(probe, REFUSED)
+    rig.conclude(rig.transacted(), Settled(None))
+    rig.conclude(rig.transacted(), Resynced(1))
+    for after, proof in ((0.0, False), (LACKED_FOR, True)):
+        rig.now += after
+        for device in rig.devices:
+            assert device.shapes is not None
+            device.shapes.extra_arrived(rig.now)
+        probe = reads(rig)[1]
+        assert (probe.token == PROOF) is proof
+        rig.conclude(probe, Resynced(1))
+        rig.conclude(rig.transacted(), Settled(None))
+        rig.now += 10.0

@@ -215,7 +215,7 @@ class Device:
             return 0.0
         proof = self.seconds(PROOF_COST) + self.settled_after
         loops = self.shapes.of_resync(None, 2, self.probe_spans) is None
-        most = MOST_HELD if loops or self.may_be_proven else 1
+        most = MOST_HELD if loops or self.may_be_proven(0.0) else 1
         blocks = Counter(block.every for block in self.blocks)
         return sum(math.ceil(count / most) * proof / every for every, count in blocks.items())
 
@@ -359,11 +359,11 @@ class Device:
         some = runs[:: 1 + len(runs) // MOST_PROBED]
         return some if self.last_read is None else (self.last_read, *some)
 
-    @property
-    def may_be_proven(self) -> bool:
-        """True if a resync with the token `PROOF` has a reply that no unanswered request has."""
+    def may_be_proven(self, now: float) -> bool:
+        """Returns True if a resync with the token `PROOF` has a reply that no unanswered request
+        has."""
         shapes, asked = self.shapes, self.health.unanswered.spans
-        if shapes is None or None in asked:
+        if shapes is None or None in asked or now < shapes.proofs.lacked_until:
             return False
         own = shapes.of_resync(self.health.outstanding, PROOF, self.probe_spans)
         return own is not None and own not in {shapes.of(span) for span in asked if span}

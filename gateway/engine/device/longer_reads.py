@@ -24,12 +24,12 @@ class LongerReads:
 
     __slots__ = (
         "_bad",
-        "_driver",
         "_hull",
         "_lacking",
         "_shapes",
         "alone",
         "by_span",
+        "driver",
         "failed",
         "forget_at",
     )
@@ -41,7 +41,7 @@ class LongerReads:
         bad: BadAddresses,
     ) -> None:
         """`tags`: the first and last address of the tags, by area."""
-        self._driver = driver
+        self.driver = driver
         self._hull = tags
         self._bad = bad
         self.by_span: dict[Span, list[Choice]] = {}
@@ -61,13 +61,13 @@ class LongerReads:
 
     def planned(self, blocks: Sequence[Block]) -> None:
         """Notes the blocks of a new plan."""
-        self._shapes = Counter(self._driver.reply_shape(block.span) for block in blocks)
+        self._shapes = Counter(self.driver.reply_shape(block.span) for block in blocks)
 
     def costs(self, block: Block) -> list[Cost]:
         """Returns the costs of the spans that are usually read for the block."""
-        alone = block.listed or self._shapes[self._driver.reply_shape(block.span)] < 2
+        alone = block.listed or self._shapes[self.driver.reply_shape(block.span)] < 2
         choices = [] if alone else self._choose(block.span, MOST_CHOICES)
-        return [cost for span, _ in choices if (cost := self._driver.cost(span))] or [block.cost]
+        return [cost for span, _ in choices if (cost := self.driver.cost(span))] or [block.cost]
 
     def refused(self, span: Span, longer: Span, now: float) -> None:
         """Notes that addresses beside the span do not exist. Those on its other side may."""
@@ -121,12 +121,12 @@ class LongerReads:
 
     def _choose(self, span: Span, most: int) -> list[Choice]:
         """Returns the span, and longer ones whose replies have other shapes; `most` in all."""
-        found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
+        found: dict[Hashable, Span] = {self.driver.reply_shape(span): span}
         _, lacking = self._lacking.get(span, (0.0, []))
         for longer in self._longer(span):
             if any(within(refused, longer) for refused in lacking):
                 continue
-            found.setdefault(self._driver.reply_shape(longer), longer)
+            found.setdefault(self.driver.reply_shape(longer), longer)
             if len(found) == most:
                 break
         return [(read, shape) for shape, read in found.items()]
@@ -142,7 +142,7 @@ class LongerReads:
                 if among and not (first <= longer.start and end <= last + 1):
                     continue
                 crosses = any(longer.start < place < end for place in cuts)
-                if not crosses and self._driver.cost(longer) is not None:
+                if not crosses and self.driver.cost(longer) is not None:
                     yield longer
 
 

@@ -8,6 +8,7 @@ addresses more. An extra reply then arrives as a stray frame.
 
 from collections import deque
 from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 
 from gateway.engine.device.long_writes import LongWrite
 from gateway.engine.device.longer_reads import MOST_CHOICES, LongerReads
@@ -22,8 +23,25 @@ WARY = 1.5  # the same after an extra reply: others may be as late
 WARY_FOR = 600.0  # seconds
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
+LACKED_FOR = 600.0  # seconds until a refused resync is tried again
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
+
+
+@dataclass(slots=True)
+class ProofPace:
+    """The reads of one device that a resync proves. Noise destroys the proof of many more often."""
+
+    most: int = 1
+    lacked_until: float = -NEVER  # until then it has no read with a form of its own: refused
+
+    def ended(self, *, proven: bool) -> None:
+        """Notes the end of reads that waited for one resync."""
+        self.most = min(2 * self.most, MOST_HELD) if proven else 1
+
+    def lacks(self, now: float) -> None:
+        """Notes that the device refused the read with a form of its own."""
+        self.lacked_until = now + LACKED_FOR
 
 
 class ReplyShapes:
@@ -31,7 +49,6 @@ class ReplyShapes:
 
     __slots__ = (
         "_acked",
-        "_driver",
         "_mark",
         "_recent",
         "_unclear_until",
@@ -41,13 +58,14 @@ class ReplyShapes:
         "last",
         "longer",
         "mark_due",
+        "proofs",
         "proven",
         "quiet",
         "span",
         "wary_at",
     )
 
-    def __init__(self, driver: UnnumberedReplies, longer: LongerReads) -> None:
+    def __init__(self, longer: LongerReads) -> None:
         self.longer = longer
         self.last: Hashable = None  # shape of the reply to the last request
         self._used: dict[Hashable, float] = {}  # when a read with each shape was sent last
@@ -62,8 +80,8 @@ class ReplyShapes:
         # Until then one more error reply may arrive, or the reply to a broadcast
         self._unclear_until = -NEVER
         self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
+        self.proofs = ProofPace()
         self._mark = MARK_FIRST
-        self._driver = driver
 
     def polled(self, block: Block, now: float) -> Span:
         """Returns the span to read for the block: its own, or a longer one around it."""
@@ -111,7 +129,7 @@ class ReplyShapes:
 
     def of(self, span: Span) -> Hashable:
         """Returns the shape of the reply to a read of the span."""
-        return self._driver.reply_shape(span)
+        return self.longer.driver.reply_shape(span)
 
     def probed(
         self, outstanding: Span | None, token: int, spans: Sequence[Span], now: float
@@ -121,7 +139,7 @@ class ReplyShapes:
 
     def of_resync(self, outstanding: Span | None, token: int, spans: Sequence[Span]) -> Hashable:
         """Returns the shape of the reply to a resync, as the driver."""
-        return self._driver.resync_shape(outstanding, token, spans)
+        return self.longer.driver.resync_shape(outstanding, token, spans)
 
     def _sent(self, shape: Hashable, now: float) -> None:
         self._recent.append(shape)
@@ -138,9 +156,9 @@ class ReplyShapes:
         where the acknowledgement may be an extra one. `reads`: the span is read before, because
         parts of its words are written.
         """
-        replies = self._driver.write_shapes(span, units)
+        replies = self.longer.driver.write_shapes(span, units)
         if reads:
-            replies = (self._driver.reply_shape(span), None)
+            replies = (self.longer.driver.reply_shape(span), None)
         before, after = False, self.may_be_extra(replies[-1], now)
         for shape in replies[:-1]:
             before = self.is_wary or now - self._used.get(shape, -NEVER) < self.quiet
@@ -152,7 +170,7 @@ class ReplyShapes:
         """Returns True if no acknowledgement of these requests can be taken for another."""
         shapes, at = set[Hashable](), 0
         for span in long.spans:
-            shapes.add(self._driver.write_shapes(span, units[at : at + span.size])[-1])
+            shapes.add(self.longer.driver.write_shapes(span, units[at : at + span.size])[-1])
             at += span.size
         return None not in shapes and len(shapes) == len(long.spans)
 
@@ -220,4 +238,4 @@ def reply_shapes(driver: AnyDriver, tags: Sequence[Tag], bad: BadAddresses) -> R
         area, start, size = tag.span
         first, last = hull.get(area, (start, start))
         hull[area] = (min(first, start), max(last, start + size - 1))
-    return ReplyShapes(driver, LongerReads(driver, hull, bad))
+    return ReplyShapes(LongerReads(driver, hull, bad))

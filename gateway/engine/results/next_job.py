@@ -122,8 +122,7 @@ class NextJob:
         self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         device = probe.device
-        if traffic.extra:
-            self._in_flight.doubt()
+        self.proofs.probed(probe, result, traffic, now)
         match result:
             case (
                 Resynced() | Refused()
@@ -133,7 +132,7 @@ class NextJob:
                     outstanding += device.health.unanswered.either
                 inherited = told_from < EVERY_REQUEST and (self.inherits or device.health.inherits)
                 if not probe.again and (outstanding > told_from or inherited):
-                    if told_from and not inherited and device.may_be_proven:
+                    if told_from and not inherited and device.may_be_proven(now):
                         proof = Probe(device, probe.outstanding, PROOF, timeout=probe.timeout)
                         self._in_flight.follow(proof)
                         return

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.reply_shapes import MOST_HELD, SHOWN
-from gateway.engine.jobs.jobs import Probe, Settle
+from gateway.engine.device.reply_shapes import SHOWN
+from gateway.engine.jobs.jobs import Probe, Result, Settle, Traffic
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.schedule.in_flight import HeldRead, InFlight
 from gateway.engine.schedule.schedule import Schedule
-from gateway.errors import Unsteady
+from gateway.errors import Refused, Unsteady
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
 LONGEST = 0.5  # seconds: then reads get their proof
@@ -30,7 +30,6 @@ class Proofs:
         self._in_flight = in_flight
         self._results = results
         self._polls = polls
-        self._most = 1  # reads for one resync: noise destroys the proof of many more often
 
     def hold(self, read: HeldRead, *, extra: bool) -> None:
         """Holds the values of a good read. `extra`: an extra reply arrived with its own."""
@@ -52,17 +51,25 @@ class Proofs:
             return
         for read in outstanding:
             health.left_outstanding(read.poll.job.span, now)
-        token = PROOF if device.may_be_proven else health.next_probe_token()
+        token = PROOF if device.may_be_proven(now) else health.next_probe_token()
         last, spans = health.outstanding, device.probe_spans
         is_told = token == PROOF or shapes.of_resync(last, token, spans) is None
         ends = self._schedule.requests.waiting or now - in_flight.begun >= LONGEST
-        most = 0 if ends or in_flight.doubted or not is_told else self._most
+        most = 0 if ends or in_flight.doubted or not is_told else shapes.proofs.most
         held = [read.poll for read in in_flight.held]
         if others := self._schedule.alongside(device, int(len(held) < most), now, held):
             in_flight.follow(others[0])
             return
         shapes.probed(last, token, spans, now)
         in_flight.follow(Probe(device, last, token))
+
+    def probed(self, probe: Probe, result: Result, traffic: Traffic, now: float) -> None:
+        """Takes what arrived for a resync: extra replies, or a refusal of its read."""
+        if traffic.extra:
+            self._in_flight.doubt()
+        shapes = probe.device.shapes
+        if probe.token == PROOF and isinstance(result, Refused) and shapes is not None:
+            shapes.proofs.lacks(now)
 
     def resynced(self, probe: Probe, told_from: int, now: float, time: int) -> None:
         """Releases the reads that waited for this resync, if no extra reply has arrived.
@@ -85,8 +92,8 @@ class Proofs:
         """Ends the reads that waited for a proof, if there are any."""
         held, doubted = self._in_flight.release()
         proven = proven and not doubted
-        if held:
-            self._most = min(2 * self._most, MOST_HELD) if proven else 1
+        if held and (shapes := held[0].poll.device.shapes) is not None:
+            shapes.proofs.ended(proven=proven)
         for read in held:
             if proven:
                 self._polls.read(*read)
