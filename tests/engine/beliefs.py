@@ -159,6 +159,13 @@ BELIEFS = (
         ALIVE_FOR,
     ),
     Belief(
+        "the device lacks a read with a form of its own",
+        "a refusal of this resync",
+        "ten minutes",
+        "one such resync proves several reads",
+        WARY_FOR,
+    ),
+    Belief(
         "a device that returns is as quick as before",
         "its measured turnaround",
         "a sound frame after a short probe",

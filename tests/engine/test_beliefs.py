@@ -9,6 +9,7 @@ import pytest
 from gateway.engine.device.health import FORGOTTEN, State
 from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
 from gateway.engine.device.probe_pace import PROBE_SPREAD
+from gateway.engine.device.reply_shapes import ProofPace
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
@@ -343,6 +344,12 @@ def noise() -> Way:
     return lambda after: not (is_noisy(one, [one], HOUR + after) or is_noisy(late, [late], HOUR))
 
 
+def no_form_of_its_own() -> Way:
+    pace = ProofPace()
+    pace.lacks(HOUR)
+    return lambda after: pace.lacked_until <= HOUR + after
+
+
 def as_quick_as_before() -> Way:
     health, now = link_device().health, HOUR
     health.unclear(SILENCE, None, now)
@@ -379,6 +386,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "a device is offline": offline,
     "a device that is never read does not answer": never_read,
     "noise destroys its replies": noise,
+    "the device lacks a read with a form of its own": no_form_of_its_own,
     "a device that returns is as quick as before": as_quick_as_before,
     "earlier requests are kept": kept_requests,
 }

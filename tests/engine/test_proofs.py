@@ -7,7 +7,7 @@ import pytest
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.device.reply_shapes import LACKED_FOR, SHOWN, WARY_FOR
+from gateway.engine.device.reply_shapes import SHOWN, WARY_FOR
 from gateway.engine.forecast import forecast
 from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
 from gateway.engine.results.proofs import UNPROVEN
@@ -423,7 +423,7 @@ def test_a_device_that_refuses_the_read_of_a_form_of_its_own_is_asked_for_others
     rig.conclude(probe, REFUSED)
     rig.conclude(rig.transacted(), Settled(None))
     rig.conclude(rig.transacted(), Resynced(1))
-    for after, proof in ((0.0, False), (LACKED_FOR, True)):
+    for after, proof in ((0.0, False), (WARY_FOR, True)):
         rig.now += after
         for device in rig.devices:
             assert device.shapes is not None

@@ -23,7 +23,6 @@ WARY = 1.5  # the same after an extra reply: others may be as late
 WARY_FOR = 600.0  # seconds
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
-LACKED_FOR = 600.0  # seconds until a refused resync is tried again
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
 
@@ -41,7 +40,7 @@ class ProofPace:
 
     def lacks(self, now: float) -> None:
         """Notes that the device refused the read with a form of its own."""
-        self.lacked_until = now + LACKED_FOR
+        self.lacked_until = now + WARY_FOR
 
 
 class ReplyShapes:
