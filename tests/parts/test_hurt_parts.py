@@ -227,6 +227,7 @@ async def test_each_file_hangs_and_nothing_else_does(tmp_path: Path) -> None:
         "history.db",
         "state.json",
         "alarms.json",
+        "notify.json",
         "audit.jsonl",
         "hmi",
         "",
