@@ -258,5 +258,11 @@ def _trusted(ca: Path | None) -> ssl.SSLContext:
 
 def _said(error: Exception) -> str:
     """Returns one sentence. A server may answer anything."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, smtplib.SMTPResponseException):
+        reply = error.smtp_error
+        said = reply.decode(errors="replace") if isinstance(reply, bytes) else reply
+        text = f"the server answers {error.smtp_code} {said}"
+    else:
+        text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
+    text = " ".join(text.split())
     return "".join(c if c.isprintable() else "?" for c in text)[:200]
