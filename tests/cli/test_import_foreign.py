@@ -69,7 +69,13 @@ def values(config: Path) -> dict[str, Value | None]:
             "wb-mqtt-serial.json",
             MODBUS,
             (),
-            {"plc/Gas_pressure": 12.3, "plc/Flow": 12.5, "plc/Running": True, "plc/Door": True},
+            {
+                "plc/Gas_pressure": 12.3,
+                "plc/Flow": 12.5,
+                "plc/Running": True,
+                "plc/Door": True,
+                "plc/Door_no._2": True,
+            },
         ),
         (
             "kepware.json",
@@ -145,6 +151,7 @@ def test_one_command_makes_values_of_a_sheet_or_project(
         ("kepware.json", "left out: Root, because of servermain.TAG_SCALING_CLAMP_LOW true"),
         ("home-assistant.yaml", "left out: broken, because of nan_value 32767"),
         ("wb-mqtt-serial.json", "left out: Sensor, because of error_value 0x7FFF"),
+        ("wb-mqtt-serial.json", "left out: Level, without an address"),
         ("gx-works3.csv", "1 tags left out: the PLC's program chose their addresses itself"),
     ],
 )
@@ -191,8 +198,8 @@ def test_a_project_that_is_none_is_refused_soon(text: str) -> None:
 def test_lists_in_lists_do_not_grow() -> None:
     names = "abcdefghij"
     grown = [f"{b}: &{b} [{','.join(9 * [f'*{a}'])}]" for a, b in pairwise(names)]
-    grid = read_grid("\n".join(["a: &a [x]", *grown, "modbus: *j", ""]).encode())
-    assert grid.rows == [(0, [])]
+    with pytest.raises(ConfigError, match="it has no tag that can be read here"):
+        read_grid("\n".join(["a: &a [x]", *grown, "modbus: *j", ""]).encode())
 
 
 def test_a_dry_run_checks_and_writes_nothing(command: Command, tmp_path: Path) -> None:

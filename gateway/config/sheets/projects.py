@@ -7,7 +7,7 @@ like those of any sheet; its connections become lines.
 import json
 import re
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,6 +18,7 @@ from gateway.config.sheets import cells
 from gateway.errors import ConfigError
 
 _MOST_TAGS = 100_000
+_NAMED = 5  # tags in a note
 _MOST_YAML = 2_000_000  # characters: some seconds
 _FIELD = re.compile(r"\{([^{}]+)\}")
 _COMMENT = re.compile(r"(?m)^\s*//.*$")
@@ -79,17 +80,25 @@ class _Reader:
     spec: Mapping[str, Any]
     used: set[str] = field(default_factory=set)
     unused: dict[str, None] = field(default_factory=dict)
+    left: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  # by reason
 
     def project(self, tree: object) -> Project:
         found, tags = Project(), []
-        for names, told in self.spec["tags"].items():
-            path = names.split(".")
+        for place, told in self.spec["tags"].items():
+            path = place.split(".")
             root = {path[0]: tree} if isinstance(tree, list) else tree
             for fields in self._walk(root, ["", *path], {}):
                 tags.append({**self.spec.get("defaults", {}), **told, **fields})
                 if len(tags) > _MOST_TAGS:
                     raise ConfigError(f"the project has more than {_MOST_TAGS} tags")
-        rows = [row for one in tags if (row := self._row(one, found.notes)) is not None]
+        rows = [row for one in tags if (row := self._row(one)) is not None]
+        for why, names in self.left.items():
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            found.notes.append(f"left out: {', '.join(names[:_NAMED])}{more}, {why}")
+        if not rows:
+            raise ConfigError(
+                "; ".join(["it has no tag that can be read here", *found.notes])[:500]
+            )
         _name_devices(rows)
         for row in rows:
             _add_device(found.lines, row)
@@ -136,7 +145,7 @@ class _Reader:
                     found[name] = self._said("fields", name, _text(value))
         return found
 
-    def _row(self, fields: Fields, notes: list[str]) -> dict[str, str] | None:
+    def _row(self, fields: Fields) -> dict[str, str] | None:
         """Returns the settings of a tag; None for one that is left out."""
         skip, refuse = self.spec.get("skip", {}), self.spec.get("refuse", {})
         self.used |= {*skip, *refuse}
@@ -152,18 +161,20 @@ class _Reader:
         row = {ours: self._filled(ours, theirs, parts) for ours, theirs in settings}
         if not row["name"]:
             return None
-        for name, harmless in refuse.items():
-            if fields.get(name, "") not in ("", *harmless):
-                notes.append(f"left out: {row['name']}, because of {name} {fields[name]}")
-                return None
         kind = cells.kind(row["type"], row.get("length", "")) if row["type"] != "string" else "?"
-        if kind and kind not in cells.words("types").values():
-            notes.append(f"left out: {row['name']}, of type {row['type']}")
-            return None
         _set_address(row)
         _set_order(row, kind or "")
-        if not row["address"]:
-            notes.append(f"left out: {row['name']}, without an address")
+        reasons = [
+            *(
+                f"because of {name} {fields[name]}"
+                for name, harmless in refuse.items()
+                if fields.get(name, "") not in ("", *harmless)
+            ),
+            f"of type {row['type']}" * bool(kind and kind not in cells.words("types").values()),
+            "without an address" * (not row["address"]),
+        ]
+        if why := next(filter(None, reasons), ""):
+            self.left[why].append(row["name"])
             return None
         return row
 
@@ -189,6 +200,8 @@ def _set_address(row: dict[str, str]) -> None:
     table, number, bit = (row.pop(name, "") for name in _PARTS)
     table = _TABLES.get(table, table)
     row.setdefault("address", "")
+    if table and not number:
+        row["address"] = ""  # it has a form that no pattern knows
     if not (table and number):
         return
     with_bit = f".{bit}" if bit and table in ("holding", "input") else ""
@@ -197,6 +210,8 @@ def _set_address(row: dict[str, str]) -> None:
     except ValueError:
         return
     row["address"] = f"{table}:{first}{with_bit}"
+    if table in ("discrete", "input"):
+        row.pop("write", None)  # what a project says of a switch on an input
     if with_bit or table in ("coil", "discrete"):
         row["type"] = "bool"
 
@@ -214,11 +229,12 @@ def _set_order(row: dict[str, str], kind: str) -> None:
 
 
 def _name_devices(rows: Iterable[dict[str, str]]) -> None:
-    """Gives each station of each port a name of its own."""
+    """Gives each station of each port a name of its own, and each of its tags."""
     stations: dict[str, dict[tuple[str, str], None]] = defaultdict(dict)
     for row in rows:
         row["device"] = cells.name(row["device"]).replace("/", "_")
         stations[row["device"]][row["port"], row["station"]] = None
+    seen: Counter[tuple[str, str]] = Counter()
     for row in rows:
         known = list(stations[row["device"]])
         if len(known) > 1:
@@ -226,6 +242,9 @@ def _name_devices(rows: Iterable[dict[str, str]]) -> None:
             at = known.index((row["port"], row["station"]))
             own = row["station"] if len({*numbers}) == len(numbers) else str(at + 1)
             row["device"] = f"{row['device']}-{own}"
+        seen[same := (row["device"], cells.name(row["name"]))] += 1
+        if seen[same] > 1:  # two channels of which one is shown
+            row["name"] = f"{row['name']} no. {seen[same]}"
 
 
 def _add_device(lines: dict[str, dict[str, Any]], row: Fields) -> None:
