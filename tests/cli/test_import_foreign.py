@@ -110,7 +110,7 @@ def values(config: Path) -> dict[str, Value | None]:
                 "boiler/energy": -70.0,
                 "boiler/flow": 12.5,
                 "boiler/pressure": 12.3,
-                "meters-3/flow": 12.5,
+                "meters-3/water/flow": 12.5,
                 "meters-4/door": True,
             },
         ),

@@ -105,7 +105,8 @@ class _Reader:
         titles = list(dict.fromkeys(title for row in rows for title in row if row[title]))
         titles = [title for title in titles if title not in _OF_LINE]
         found.rows = [titles, *([row.get(title, "") for title in titles] for row in rows)]
-        if unused := [name for name in self.unused if name not in self.used]:
+        known = {*self.used, *(f"{name}.length" for name in self.used)}
+        if unused := [name for name in self.unused if name not in known]:
             found.notes.append(f"fields of {self.program} that are not used: {', '.join(unused)}")
         return found
 
