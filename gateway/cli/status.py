@@ -3,7 +3,7 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -93,7 +93,7 @@ def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Rendera
         Text(),
         *_calls(documents),
         *_transfers(documents),
-        *_doors(documents),
+        *doors_table(below("doors/", documents)),
         _services(documents, outcomes),
     ]
     for heading, style, found in (
@@ -193,10 +193,10 @@ def _transfers(documents: Documents) -> list[RenderableType]:
     return [table, Text()] if rows else []
 
 
-def _doors(documents: Documents) -> list[RenderableType]:
+def doors_table(doors: Iterable[tuple[str, Mapping[str, Any]]]) -> list[RenderableType]:
     """Returns the table of the doors and the programs there; nothing without any."""
     table = _table("door", "line", "share", "program", "for", "requests", "writes", "refused")
-    for name, document in below("doors/", documents):
+    for name, document in doors:
         door = (Text(name), Text(document["line"]), f"{_share(document['share'])} of the wire")
         for program in document["programs"]:
             counts = (str(program[one]) for one in ("requests", "writes", "refused"))

@@ -370,6 +370,8 @@ class Line:
 
     def _end(self, request: Request, outcome: Outcome) -> None:
         waiting = self._outcomes.pop(request)
+        if isinstance(request, Write) or request.span is None:  # no peek
+            self.engine.record.wrote_at = _now()
         if waiting.done():  # the client no longer waits
             return
         if isinstance(outcome, GatewayError):

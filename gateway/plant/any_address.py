@@ -56,6 +56,24 @@ class AnyAddress:
             units += map(int, (await line.peek(receiver, part, within)).split())
         return units
 
+    def known(self, device: str, span: Span, max_age: float) -> list[int] | None:
+        """Returns the units if a poll has read all of them together in the last `max_age` seconds,
+        and no write or command on the line has ended since."""
+        line, receiver = self.place(device)
+        if not (line.engine.is_open and receiver.health.online):
+            return None
+        since = asyncio.get_running_loop().time() - max_age
+        for poll in line.engine.polls(receiver):
+            block, reads = poll.block, poll.reads
+            ahead = span.start - block.span.start
+            if block.listed or block.of_fields or span.area != block.span.area:
+                continue
+            if ahead < 0 or ahead + span.size > block.span.size:
+                continue
+            if reads.scan and reads.at and reads.at > max(since, line.engine.record.wrote_at):
+                return [int(unit) for unit in reads.scan.units[ahead : ahead + span.size]]
+        return None
+
     def target(self, device: str, span: Span) -> Tag:
         """Returns a tag of these addresses for one write. No client sees it."""
         _, receiver = self.place(device)

@@ -13,6 +13,7 @@ from gateway.planning.wire_timing import WireTiming
 from gateway.simulator.port import HalfDuplex
 from gateway.stations.station import Station
 from gateway.transport.os_errors import line_down
+from gateway.transport.terminal import put_link, take_link
 
 _MOST_READ = 4096  # bytes
 MakeBus = Callable[[Callable[[bytes], None]], HalfDuplex]  # of the function that takes the replies
@@ -38,7 +39,7 @@ async def serve_on_pty(
 ) -> Served:
     """Serves stations on a pseudo terminal, at the speed of the line; `link` is a link to it.
 
-    A link that points elsewhere is replaced, anything else at that path is left alone.
+    A link to another terminal is replaced, anything else at that path is left alone.
     Raises `LineDown`.
     """
     try:
@@ -71,9 +72,7 @@ class _Pty:
 
     def link(self, path: Path) -> None:
         """Raises `OSError`."""
-        if path.is_symlink():
-            path.unlink()
-        path.symlink_to(self._name)
+        put_link(path, self._name)
         self._link = path
         self.address = str(path)
 
@@ -94,9 +93,7 @@ class _Pty:
         os.close(self._master)
         os.close(self._slave)
         if self._link is not None:
-            with suppress(OSError):
-                if self._link.readlink() == Path(self._name):  # unless another program replaced it
-                    self._link.unlink()
+            take_link(self._link, self._name)
 
 
 async def serve_on_tcp(

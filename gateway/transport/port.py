@@ -5,7 +5,7 @@ from collections.abc import Container
 from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_address
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from gateway.errors import ConfigError
 from gateway.transport.rs485 import Rs485
@@ -31,6 +31,15 @@ class Port(Protocol):
 
     async def close(self) -> None:
         """Closes the port; never raises."""
+
+
+@runtime_checkable
+class Adjustable(Protocol):
+    """A port whose speed, format and modem lines can be changed while it is open."""
+
+    async def adjust(self, setting: int, value: int) -> int:
+        """Changes a setting of RFC 2217, such as `telnet.Setting.BAUDRATE`, when all bytes have
+        been sent. Returns the value that the port has now. Never raises."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,6 +125,15 @@ class Rfc2217Port:
                 actual=self._acknowledged[setting],
             )
 
+    async def adjust(self, setting: int, value: int) -> int:
+        """As `Adjustable.adjust`. A server that does not acknowledge is believed."""
+        asked = Setting(setting)
+        if self._tcp is not None and asked is not Setting.MODEM_STATE:
+            self._acknowledged.pop(asked, None)
+            with suppress(LineDown):
+                await self._ask(self._tcp, asked, value)
+        return self._acknowledged.get(asked, value)
+
     async def _until(self, happened: Callable[[], bool], timeout: float) -> bool:
         """Returns True when it happens in time. Raises `LineDown` when the connection is lost."""
         try:

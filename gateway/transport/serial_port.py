@@ -13,6 +13,7 @@ from gateway.transport.os_errors import line_down
 from gateway.transport.port import Port, Receiver, SerialPath, SerialSettings
 from gateway.transport.rs485 import set_direction
 from gateway.transport.stream import StreamPort
+from gateway.transport.telnet import PARITIES, Control, Setting
 
 _SENTENCES = {
     errno.ENOENT: "no such port",
@@ -35,9 +36,10 @@ async def open_serial(
 
     Bytes that the system received before are discarded.
     """
-    port = StreamPort(where.path, receiver, settings.baudrate)
+    port = SerialPort(where.path, receiver, settings)
     data_bits, parity, stop_bits = tuple(settings.format)
-    if await asyncio.to_thread(_is_pty, where.path):
+    port.is_pty = await asyncio.to_thread(_is_pty, where.path)
+    if port.is_pty:
         data_bits, parity = "8", "N"
     try:
         async with asyncio.timeout(timeout):
@@ -59,6 +61,113 @@ async def open_serial(
         await port.close()
         raise line_down(where.path, error, _SENTENCES) from error
     return port
+
+
+class SerialPort(StreamPort):
+    """An open serial port."""
+
+    def __init__(self, name: str, receiver: Receiver, settings: SerialSettings) -> None:
+        super().__init__(name, receiver, settings.baudrate)
+        self._rts_is_direction = settings.rs485 is not None
+        self.is_pty = False
+
+    async def adjust(self, setting: int, value: int) -> int:
+        """As `Adjustable.adjust`. Modem lines that the port has not are taken for set."""
+        try:
+            if setting == Setting.CONTROL:
+                return await self._control(value)
+            if setting == Setting.MODEM_STATE:
+                return _modem_state(await self._pins())
+            if self.is_pty and setting in (Setting.DATA_BITS, Setting.PARITY):
+                return value
+            found = await asyncio.to_thread(_adjusted, self.descriptor(), setting, value)
+        except (OSError, serialx.SerialException, LineDown):
+            return value if setting == Setting.CONTROL else 0
+        if setting == Setting.BAUDRATE:
+            self.expects(found)
+        return found
+
+    async def _pins(self) -> serialx.ModemPins:
+        transport = self.transport
+        if not isinstance(transport, serialx.SerialTransport):
+            raise LineDown(f"{self.name}: closed")
+        return await transport.get_modem_pins()
+
+    async def _control(self, value: int) -> int:
+        """Returns the state of a modem line, of the break or of the flow control: there is none."""
+        pins, transport = await self._pins(), self.transport
+        if not isinstance(transport, serialx.SerialTransport):
+            return value
+        match value:
+            case Control.DTR:
+                return Control.DTR_ON if pins.dtr is serialx.PinState.HIGH else Control.DTR_OFF
+            case Control.RTS:
+                return Control.RTS_ON if pins.rts is serialx.PinState.HIGH else Control.RTS_OFF
+            case Control.DTR_ON | Control.DTR_OFF:
+                await transport.set_modem_pins(dtr=value == Control.DTR_ON)
+            case Control.RTS_ON | Control.RTS_OFF if not self._rts_is_direction:
+                await transport.set_modem_pins(rts=value == Control.RTS_ON)
+            case Control.BREAK:
+                return Control.BREAK_OFF
+            case Control.BREAK_ON:  # as long as the driver makes it: none is left on
+                await asyncio.to_thread(_send_break, self.descriptor())
+            case _ if value < Control.BREAK:
+                return Control.NO_FLOW
+            case _ if value >= Control.INBOUND_FLOW:
+                return Control.NO_INBOUND_FLOW
+        return value
+
+
+def _send_break(port: int) -> None:
+    """Blocks. Raises `OSError`."""
+    import termios
+
+    try:
+        termios.tcsendbreak(port, 0)
+    except termios.error as error:
+        raise OSError(*error.args) from error
+
+
+def _modem_state(pins: serialx.ModemPins) -> int:
+    lines = ((pins.car, 128), (pins.rng, 64), (pins.dsr, 32), (pins.cts, 16))
+    return sum(bit for pin, bit in lines if pin is serialx.PinState.HIGH)
+
+
+def _adjusted(port: int, setting: int, value: int) -> int:
+    """Changes a setting when all bytes have been sent; 0 asks only. Returns what the driver has
+    then. Blocks. Raises `OSError`."""
+    import termios
+
+    from gateway.transport.terminal import RATES
+
+    rates = {rate: code for code, rate in RATES.items()}
+    sizes = {5: termios.CS5, 6: termios.CS6, 7: termios.CS7, 8: termios.CS8}
+    odd = termios.PARENB | termios.PARODD
+    parities = {PARITIES["N"]: 0, PARITIES["O"]: odd, PARITIES["E"]: termios.PARENB}
+    stops = {1: 0, 2: termios.CSTOPB}
+    masks = {
+        Setting.DATA_BITS: (termios.CSIZE, sizes),
+        Setting.PARITY: (odd, parities),
+        Setting.STOP_BITS: (termios.CSTOPB, stops),
+    }
+    queues = {1: termios.TCIFLUSH, 2: termios.TCOFLUSH}
+    try:
+        if setting == Setting.PURGE:
+            termios.tcflush(port, queues.get(value, termios.TCIOFLUSH))
+            return value
+        mode = termios.tcgetattr(port)
+        mask, codes = masks.get(Setting(setting), (0, rates))
+        if value in codes:
+            if mask:
+                mode[2] = mode[2] & ~mask | codes[value]
+            else:
+                mode[4] = mode[5] = codes[value]
+            termios.tcsetattr(port, termios.TCSADRAIN, mode)
+            mode = termios.tcgetattr(port)
+        code = mode[2] & mask if mask else mode[5]
+        return next((number for number, one in codes.items() if one == code), 0)
+    except termios.error as error:
+        raise OSError(*error.args) from error
 
 
 def _is_pty(path: str) -> bool:

@@ -80,6 +80,10 @@ class StreamPort(asyncio.Protocol):
         """The transport, for the signals of a serial port, and the certificate of the peer."""
         return self._transport
 
+    def expects(self, baudrate: int) -> None:
+        """Notes another baud rate of the wire behind the port."""
+        self._allowance = Allowance(baudrate)
+
     def descriptor(self) -> int:
         """Returns the file descriptor of an open serial port. Raises `LineDown`."""
         if self._transport is None or self._loss is not None:

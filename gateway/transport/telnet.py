@@ -12,6 +12,7 @@ BINARY, SUPPRESS_GO_AHEAD, COM_PORT = 0, 3, 44  # the options to agree on; all o
 _WANTED = frozenset({BINARY, SUPPRESS_GO_AHEAD, COM_PORT})  # on either side
 
 _LONGEST_SUBNEGOTIATION = 256  # bytes; a longer one is dropped, or it would swallow all data
+_MOST_CHANGES = 3  # of one option that are answered
 _SERVER = 100  # the server's reply to request n has the number n + 100
 
 
@@ -22,12 +23,24 @@ class Setting(IntEnum):
     DATA_BITS = 2
     PARITY = 3
     STOP_BITS = 4
+    CONTROL = 5
+    MODEM_STATE = 7  # the server reports it by itself
     PURGE = 12
 
 
 _SETTINGS = frozenset(Setting)
 PARITIES = {"N": 1, "O": 2, "E": 3, "M": 4, "S": 5}
 PURGE_BOTH = 3  # the receive and the transmit buffer
+
+
+class Control(IntEnum):
+    """Values of `Setting.CONTROL`. The first of each kind asks for the present one."""
+
+    FLOW, NO_FLOW = 0, 1
+    BREAK, BREAK_ON, BREAK_OFF = 4, 5, 6
+    DTR, DTR_ON, DTR_OFF = 7, 8, 9
+    RTS, RTS_ON, RTS_OFF = 10, 11, 12
+    INBOUND_FLOW, NO_INBOUND_FLOW = 13, 14
 
 
 class Consent(IntEnum):
@@ -70,7 +83,15 @@ class Acknowledged:
     value: int
 
 
-Event = Received | Send | Agreed | Acknowledged
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The client asks the server for something: a `Setting`, or another number of RFC 2217."""
+
+    number: int
+    data: bytes
+
+
+Event = Received | Send | Agreed | Acknowledged | Asked
 
 
 class _State(IntEnum):
@@ -85,23 +106,27 @@ class _State(IntEnum):
 
 @dataclass(slots=True)
 class Telnet:
-    """The client's end of one telnet connection to a serial port.
+    """One end of a telnet connection to a serial port: of the client, or of the server.
 
     `start` returns the first bytes to send. `feed` accepts received bytes in pieces of any size
     and never raises.
     """
+
+    serves: bool = False
 
     _state: _State = _State.DATA
     _verb: int = 0
     _body: bytearray = field(default_factory=bytearray)
     _ours: dict[int, Consent] = field(default_factory=dict)
     _theirs: dict[int, Consent] = field(default_factory=dict)
+    _changed: dict[tuple[bool, int], int] = field(default_factory=dict)  # by side and option
 
     def start(self) -> bytes:
         """Returns the offers and requests for the options."""
-        self._ours = dict.fromkeys(sorted(_WANTED), Consent.ASKED)
+        both, one = sorted(_WANTED - {COM_PORT}), sorted(_WANTED)
         # The client offers COM-PORT-OPTION (RFC 2217, section 2).
-        self._theirs = dict.fromkeys(sorted(_WANTED - {COM_PORT}), Consent.ASKED)
+        self._ours = dict.fromkeys(both if self.serves else one, Consent.ASKED)
+        self._theirs = dict.fromkeys(one if self.serves else both, Consent.ASKED)
         offers = [bytes((IAC, _WILL, option)) for option in self._ours]
         return b"".join(offers + [bytes((IAC, _DO, option)) for option in self._theirs])
 
@@ -118,6 +143,12 @@ class Telnet:
         """Returns the request to change a setting; the value 0 asks for the current one."""
         number = value.to_bytes(4 if setting is Setting.BAUDRATE else 1, "big")
         body = bytes((COM_PORT, setting)) + Telnet.encode(number)
+        return bytes((IAC, _SB)) + body + bytes((IAC, _SE))
+
+    @staticmethod
+    def answer(number: int, data: bytes) -> bytes:
+        """Returns the server's answer to `Asked`, or its report."""
+        body = bytes((COM_PORT, number + _SERVER)) + Telnet.encode(data)
         return bytes((IAC, _SB)) + body + bytes((IAC, _SE))
 
     def feed(self, data: bytes) -> list[Event]:
@@ -191,7 +222,9 @@ class Telnet:
             return
         self._state = _State.DATA
         body = bytes(self._body)
-        if len(body) > 2 and body[0] == COM_PORT and body[1] - _SERVER in _SETTINGS:
+        if self.serves and len(body) > 1 and body[0] == COM_PORT:
+            yield Asked(body[1], body[2:])
+        elif len(body) > 2 and body[0] == COM_PORT and body[1] - _SERVER in _SETTINGS:
             setting = Setting(body[1] - _SERVER)
             yield Acknowledged(setting, int.from_bytes(body[2:], "big"))
 
@@ -210,7 +243,9 @@ class Telnet:
         if before is Consent.YES if yes else before in (Consent.NO, Consent.DECLINED):
             return
         agreements[option] = Consent.YES if yes else Consent.DECLINED
-        if before is not Consent.ASKED:
+        self._changed[ours, option] = changes = self._changed.get((ours, option), 0) + 1
+        # Two ends that each change their mind would answer each other forever, too (RFC 1143).
+        if before is not Consent.ASKED and changes <= _MOST_CHANGES:
             agree, decline = (_WILL, _WONT) if ours else (_DO, _DONT)
             yield Send(bytes((IAC, agree if yes else decline, option)))
         yield Agreed(option, ours, yes)

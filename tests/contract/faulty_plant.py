@@ -73,6 +73,7 @@ SUBSCRIBED = (
     "plant/@gateway/demo/lines/hall/@trace",
 )
 REQUESTS = [
+    ("plant/@gateway/demo/doors/laptop", b'{"do":"release"}'),
     ("plant/mixer/recipe/@set", b"5"),
     ("plant/mixer/recipe/@set", b"99"),
     ("plant/mixer/speed/@set", b"1"),

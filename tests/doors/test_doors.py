@@ -17,8 +17,9 @@ from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.doors.guest import MOST_WAITING, Guest
 from gateway.parts.doors.guest_requests import GuestRequests
-from gateway.parts.doors.open_door import OpenDoor
+from gateway.parts.doors.open_door import HELD, OpenDoor
 from gateway.parts.doors.plan import door_plans, door_warnings
+from gateway.parts.doors.repeated_reads import MOST_KEPT, RepeatedReads
 from gateway.parts.doors.settings import Sharing
 from gateway.parts.doors.stores import Step
 from gateway.parts.doors.tunnel import Tunnel
@@ -62,6 +63,7 @@ LINES: dict[str, Any] = {
         },
     },
 }
+PRESS = LINES["hall"]["devices"]["press"]
 WRITES = {"press": ["holding:10..19", "coil:0..7"]}
 
 
@@ -351,7 +353,91 @@ async def test_the_wire_comes_back_when_the_program_goes() -> None:
         assert hall.door.document(now())["programs"] == []
 
 
+@on_virtual_time
+async def test_an_operator_takes_the_wire_back_for_a_minute() -> None:
+    async with opened(door("hall", "raw")) as hall:
+        program = Program(hall.door)
+        assert await program.ask(rtu("03 000a 0001")) == rtu("03 02 0000")
+        hall.door.release("zoe")
+        await asyncio.sleep(20)
+        assert program.closed
+        assert quality(hall) == ("good", None)
+        assert hall.door.connect("127.0.0.1") is None  # a tool connects again by itself
+        assert b"released; 1 connected" in hall.outcomes[0]
+        assert b"released by zoe" in hall.outcomes[1]
+        await asyncio.sleep(HELD)
+        assert await Program(hall.door).ask(rtu("03 000a 0001")) == rtu("03 02 0000")
+
+
+@on_virtual_time
+async def test_a_polled_address_is_answered_by_the_last_poll_if_it_is_young_enough() -> None:
+    tags = {f"t{n}": {"address": f"holding:{n}", "write": True} for n in range(8)}
+    press = {**PRESS, "defaults": {"every": "2s"}, "tags": tags}
+    lines = {"hall": {**LINES["hall"], "devices": {"press": press}}}
+    settings = door("hall", "modbus-tcp", writes={"press": ["holding:0..99"]}, max_age="3s")
+    async with opened(settings, lines) as hall:
+        program, record = Program(hall.door), hall.plant.lines[0].engine.devices[0].record
+        await asyncio.sleep(5)
+
+        async def asked(pdu: str) -> tuple[bytes, bool]:
+            """Returns the reply, and if the device was asked for it."""
+            before, begun = record.exchanges, now()
+            program.replies.clear()
+            program.guest.received(tcp(pdu))
+            while not program.replies:
+                await asyncio.sleep(0.001)
+            return program.replies[0][1], now() > begun + 0.002 and record.exchanges > before
+
+        def polled(numbers: range) -> bytes:
+            tags = [hall.plant.tag(f"press/t{n}") for n in numbers]
+            values = [hall.plant.sample(tag).value for tag in tags if tag is not None]
+            return tcp(f"03 {2 * len(values):02x}" + "".join(f"{value:04x}" for value in values))
+
+        assert await asked("03 0002 0004") == (polled(range(2, 6)), False)
+        assert (await asked("03 0006 0004"))[1]  # a part of it is not polled
+        assert (await asked("06 0002 0007"))[1]
+        # The poll before the write does not know of it.
+        assert (await asked("03 0002 0001"))[0] == tcp("03 02 0007")
+        await asyncio.sleep(3)
+        assert await asked("03 0002 0003") == (polled(range(2, 5)), False)
+        hall.plant.lines[0].engine.devices[0].health.online = False
+        assert hall.plant.any_address.known("press", Span("holding", 2, 1), 3.0) is None
+
+
+@on_virtual_time
+async def test_repeated_reads_are_proposed_as_tags() -> None:
+    async with opened(door("hall", "modbus-tcp")) as hall:
+        program = Program(hall.door)
+        for number in range(4):
+            await program.ask(tcp("03 000a 0002"), wait=2.0)
+            await program.ask(tcp(f"03 01{number:02x} 0001"), wait=0.5)
+            await program.ask(tcp("03 0000 0001"), wait=0.5)
+        first, second = hall.door.document(now())["reads"]
+        assert first == {
+            "device": "press",
+            "address": "holding:10",
+            "type": "uint16[2]",
+            "count": 4,
+            "every": 3.0,
+            "tags": [],
+        }
+        assert (second["address"], second["tags"]) == ("holding:0", ["speed"])
+
+
+def test_what_is_kept_of_reads_has_a_bound() -> None:
+    reads, device = RepeatedReads(), built({"lines": LINES}).devices[0]
+    for at in range(10 * MOST_KEPT):
+        reads.note("press", Span("holding", at, 1), at)
+        if at % 100 == 0:
+            reads.note("press", Span("holding", 9999, 1), at)
+    [one] = reads.documents({"press": device})
+    assert (one["address"], one["count"], one["every"]) == ("holding:9999", 20, 100.0)
+
+
 MISTAKES = {
+    "remove `allow`": door("hall", "raw", listen="/run/hall-1", allow=["10.1.0.0/16"]),
+    "settings, which are followed with `raw`": door("hall", "rfc2217", listen="/run/hall-1"),
+    "no address to listen on": door("hall", "raw", listen="run/hall-1"),
     "remove `writes`": door("hall", "raw", writes=WRITES),
     "no line hill: did you mean hall": door("hill", "modbus-tcp"),
     "can be asked by modbus-ascii, modbus-rtu or modbus-tcp": door("hall", "vigor"),

@@ -1,6 +1,6 @@
 """The telnet filter: any chopping gives the same, any bytes never raise, FF survives."""
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gateway.transport.telnet import (
@@ -95,6 +95,7 @@ def test_data_is_received_again_after_any_noise(noise: bytes, data: bytes) -> No
 @given(
     st.lists(st.sampled_from([bytes((v, o)) for v in (WILL, WONT, DO, DONT) for o in range(50)]))
 )
+@example([bytes((WILL, 44)), bytes((WONT, 44)), bytes((WILL, 44))])
 def test_two_clients_do_not_answer_each_other_forever(opening: list[bytes]) -> None:
     ends = begun(), begun()
     on_the_way = b"".join(bytes((IAC,)) + verb for verb in opening)

@@ -130,11 +130,11 @@ class Client:
         found = [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
         return sorted(found, key=lambda row: str(row["since"]))
 
-    def order(self, alarm: str, order: Mapping[str, object]) -> dict[str, object]:
-        """Returns the document of the alarm, or `error ...`. Raises as `write`."""
-        key = self._keys.status(f"alarms/{alarm}")
+    def order(self, path: str, order: Mapping[str, object]) -> dict[str, object]:
+        """Returns the document of `alarms/<alarm>` or `doors/<door>` then, or `error ...`. Raises
+        as `write`."""
         status = self._keys.status("status")
-        return self._request(key, json.dumps(order).encode(), status)
+        return self._request(self._keys.status(path), json.dumps(order).encode(), status)
 
     def trace(self, line: str, until: float | None) -> Iterator[dict[str, Any]]:
         """Yields the trace of a line, in parts. Raises `GatewayError` if nobody serves it."""

@@ -89,6 +89,7 @@ KINDS = (
         requests.AlarmDocument,
         requests.AcknowledgeRequest,
     ),
+    Kind("release", f"{_OWN}/doors/{{door}}", (SEND,), state.DoorDocument, requests.DoorRequest),
     Kind("audit", f"{_OWN}/audit/{{number}}", (PAST,), requests.AuditRecord),
     Kind("trace", f"{_OWN}/lines/{{line}}/@trace", (SUBSCRIBE,), requests.TraceDocument),
     Kind("description", f"{_OWN}/@describe", (GET,), dict[str, Any]),

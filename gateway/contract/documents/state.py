@@ -294,6 +294,21 @@ class GuestDocument(TypedDict):
     unanswered: int
 
 
+class RepeatedRead(TypedDict):
+    """Addresses that programs at a door read again and again.
+
+    `type`: of all of them, as a tag has it; `every`: seconds between two reads; `tags`: those of
+    the device that have some of these addresses.
+    """
+
+    device: str
+    address: str
+    type: str
+    count: int
+    every: float
+    tags: list[str]
+
+
 class DoorDocument(TypedDict):
     """A door of a line for other programs.
 
@@ -308,6 +323,7 @@ class DoorDocument(TypedDict):
     share: float
     turned_away: int
     programs: list[GuestDocument]
+    reads: list[RepeatedRead]
 
 
 class NotifyDocument(TypedDict):

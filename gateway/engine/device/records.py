@@ -106,6 +106,8 @@ class LineRecord:
     last_trouble: str = ""  # why the port was not open last
     falls: Falls = field(default_factory=Falls)
     calls: CallRecord | None = None  # with a modem, once it was there
+    # When a write or command ended last, by the line's clock: what was read before may be old.
+    wrote_at: float = -math.inf
 
     def open(self, now: float) -> None:
         """Notes that the port was opened."""

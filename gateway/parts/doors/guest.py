@@ -62,7 +62,7 @@ class Guest:
         self._port = None
         self.leave()
 
-    def leave(self) -> None:
+    def leave(self, _why: str = "") -> None:
         """Closes the connection. A request that was sent goes on, and is in the audit."""
         self._door.guests.discard(self)
         if self._work is not None:
@@ -96,6 +96,8 @@ class Guest:
         """Returns False if a device did not reply, or was not asked."""
         answered, door, loop = True, self._door, asyncio.get_running_loop()
         for step in steps:
+            for run in step.runs() if not step.writes else ():
+                door.reads.note(step.device, run, loop.time())
             left = at + door.settings.reply_within - loop.time()
             if left > 0:
                 by = f"door {door.settings.name}, {self._address}"

@@ -1,12 +1,15 @@
 """A door while the gateway runs: its port, and the programs that are connected."""
 
 import asyncio
+import time
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
 import structlog
 
 from gateway.config import Config
+from gateway.contract import payload
+from gateway.contract.documents.requests import OutcomeDocument
 from gateway.contract.documents.state import DoorDocument
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import LineDown
@@ -14,19 +17,23 @@ from gateway.line.line import Line
 from gateway.line.opening import Pauses
 from gateway.parts.doors.guest import Guest
 from gateway.parts.doors.guest_requests import GuestRequests
-from gateway.parts.doors.settings import RAW, Door
+from gateway.parts.doors.repeated_reads import RepeatedReads
+from gateway.parts.doors.settings import ALONE, Door
 from gateway.parts.doors.tunnel import Tunnel
 from gateway.plant.plant import Plant
 from gateway.stations.served.answering import Answerer, Answering, Wire
 from gateway.stations.served.echo import Echo
 from gateway.stations.served.registry import answerer, is_numbered
 from gateway.stations.store import Store
+from gateway.tags.timestamps import rfc3339
 from gateway.transport.listen import Listener
-from gateway.transport.port import allows, named
+from gateway.transport.port import SerialSettings, TcpAddress, allows
+from gateway.transport.terminal import Terminal
 
 log = structlog.get_logger("gateway.line")
 T = TypeVar("T")
 Audit = Callable[[int, str], None]
+HELD = 60.0  # seconds: a program that was sent away connects again by itself
 
 
 class OpenDoor:
@@ -42,14 +49,17 @@ class OpenDoor:
     ) -> None:
         self.settings = settings
         self.turns = turns
-        self.audit = audit
+        self._audit = audit
         self.line = self._line(plant)
+        self.reads = RepeatedReads()
         self.guests: set[Guest | Tunnel] = set()
         self.devices: Mapping[int, DeviceSettings] = settings.stations(plant.config)  # by station
+        self.serial = _serial(plant.config, settings.line)
         self._duty = plant.duty
         self._tasks = tasks
         self._trouble = ""
         self._turned_away = 0
+        self._held_until = 0.0  # by the loop's clock: after a release no program gets the wire
 
     def _line(self, plant: Plant) -> Line:
         return next(one for one in plant.lines if one.name == self.settings.line)
@@ -63,7 +73,8 @@ class OpenDoor:
         """Serves until cancelled."""
         pauses = Pauses(self.settings.name)
         while True:
-            listener = Listener(self.settings.where)
+            where = self.settings.where
+            listener = Listener(where) if isinstance(where, TcpAddress) else Terminal(where)
             try:
                 await listener.open()
                 log.info("door open", door=self.settings.name, line=self.settings.line)
@@ -79,8 +90,9 @@ class OpenDoor:
             await asyncio.sleep(pauses.take())
 
     def connect(self, address: str) -> Guest | Tunnel | None:
-        raw = self.settings.protocol == RAW
-        if not allows(self.settings.networks, address) or (raw and self.guests):
+        raw, networks = self.settings.protocol in ALONE, self.settings.networks
+        held = raw and (self.guests or asyncio.get_running_loop().time() < self._held_until)
+        if held or (networks and not allows(networks, address)):
             self._turned_away += 1
             log.debug("turned away", door=self.settings.name, address=address)
             return None
@@ -105,20 +117,50 @@ class OpenDoor:
     def take_over(self, config: Config, plant: Plant) -> None:
         """Takes over a changed file. Programs connect again if their devices are others now."""
         devices, line = self.settings.stations(config), self._line(plant)
+        self.serial = _serial(config, self.settings.line)
         if devices != self.devices or line is not self.line:
             self.devices, self.line = devices, line
             for guest in [*self.guests]:
                 guest.leave()
 
+    def release(self, by: str) -> None:
+        """Disconnects the programs. A raw door takes none for a minute."""
+        self.tell(f"doors/{self.settings.name}", by, 0.0, f"released; {len(self.guests)} connected")
+        self._held_until = asyncio.get_running_loop().time() + HELD
+        for guest in [*self.guests]:
+            guest.leave(f"released by {by}")
+
+    def tell(self, key: str, by: str, took: float, answer: str) -> None:
+        """Has the audit and the log keep something that was done."""
+        now = time.time_ns()
+        log.warning(
+            "door used", door=self.settings.name, line=self.settings.line, by=by, what=answer
+        )
+        event: OutcomeDocument = {
+            "key": key,
+            "value": None,
+            "time": rfc3339(now),
+            "took": round(took, 3),
+            "by": by,
+            "outcome": "obeyed",
+            "answer": answer,
+        }
+        self._audit(now, payload.document(event).decode())
+
     def document(self, now: float) -> DoorDocument:
         settings = self.settings
         return {
             "line": settings.line,
-            "listen": named(settings.where.host, settings.where.port),
+            "listen": settings.listens,
             "protocol": settings.protocol,
             "trouble": self._trouble,
             "most": settings.most,
             "share": round(self.turns.share(now), 4),
             "turned_away": self._turned_away,
-            "programs": [guest.document(now) for guest in self.guests],
+            "programs": [guest.document(now) for guest in [*self.guests]],
+            "reads": self.reads.documents({one.name: one for one in self.devices.values()}),
         }
+
+
+def _serial(config: Config, name: str) -> SerialSettings:
+    return next(line.serial for line in config.lines if line.name == name)

@@ -1,15 +1,21 @@
 """The doors as a part: other programs ask the devices of a line, between its polls."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from gateway.config import Config
+from gateway.contract import payload
 from gateway.contract.documents.state import DoorDocument
+from gateway.contract.interfaces import Keyed
+from gateway.errors import BadValue, NoHistory, Unknown
 from gateway.parts.doors.guest_requests import GuestRequests
 from gateway.parts.doors.open_door import OpenDoor
 from gateway.parts.doors.settings import Sharing
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.tags import Tag
+
+_RELEASE = b'{"do":"release"}'
 
 
 class SharingPart:
@@ -19,9 +25,11 @@ class SharingPart:
         self._core = core
         self._sharing = sharing
         self._doors: Sequence[OpenDoor] = ()
+        self._now: Callable[[], float] = time.monotonic
 
     async def run(self) -> None:
         plant = self._core.plant
+        self._now = asyncio.get_running_loop().time
         lines = {door.line for door in self._sharing.doors}
         turns = {line: GuestRequests(plant.any_address, self._core.north) for line in lines}
         async with asyncio.TaskGroup() as tasks:
@@ -37,8 +45,29 @@ class SharingPart:
             door.take_over(config, self._core.plant)
 
     def documents(self) -> Mapping[str, DoorDocument]:
-        now = asyncio.get_running_loop().time()
+        now = self._now()
         return {f"doors/{door.settings.name}": door.document(now) for door in self._doors}
+
+    # -- its keys --
+
+    def entries(self) -> Sequence[tuple[str, Callable[[], bytes]]]:
+        return [(door.settings.name, self._maker(door)) for door in self._doors]
+
+    def _maker(self, door: OpenDoor) -> Callable[[], bytes]:
+        return lambda: payload.document(door.document(self._now()))
+
+    def recorded(self, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+        raise NoHistory
+
+    async def order(self, path: str, data: bytes, by: str | None) -> bytes:
+        """Releases a door. Raises `BadValue`, `Unknown`."""
+        door = next((one for one in self._doors if one.settings.name == path), None)
+        if door is None:
+            raise Unknown(f"there is no door {payload.short(path)}")
+        if data.replace(b" ", b"") != _RELEASE:
+            raise BadValue(f"send {_RELEASE.decode()}")
+        door.release(by or "a client")
+        return self._maker(door)()
 
 
 def _make(core: Core) -> Part | None:
@@ -46,4 +75,4 @@ def _make(core: Core) -> Part | None:
     return None if sharing is None else SharingPart(core, sharing)
 
 
-KIND = Kind(_make, Phase.DRIVING)
+KIND = Kind(_make, Phase.DRIVING, serves=Keyed)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from gateway.config import Config
 from gateway.engine.forecast import LineForecast
-from gateway.parts.doors.settings import RAW, Door, Sharing
+from gateway.parts.doors.settings import ALONE, Door, Sharing
 from gateway.protocols.driver import Address, AnyDriver, Span
 
 
@@ -12,9 +12,9 @@ def door_plans(config: Config, lines: Sequence[LineForecast]) -> Iterator[str]:
     """Yields a text for each door of the file."""
     loads = {line.name: line.load for line in lines}
     for door in _doors(config):
-        if door.protocol == RAW:
+        if door.protocol in ALONE:
             yield (
-                f"door {door.name}: a program at {door.where.host}:{door.where.port} gets the wire "
+                f"door {door.name}: a program at {door.listens} gets the wire "
                 f"of line {door.line} alone; its values are then bad (maintenance)"
             )
             continue
@@ -23,10 +23,10 @@ def door_plans(config: Config, lines: Sequence[LineForecast]) -> Iterator[str]:
         stations = ", ".join(f"{name} ({one.station})" for name, one in devices.items())
         load = loads.get(door.line, 0.0)
         yield (
-            f"door {door.name}: programs at {door.where.host}:{door.where.port} ask {stations} "
+            f"door {door.name}: programs at {door.listens} ask {stations} "
             f"by {door.protocol}, and may write {written}\n"
             f"  they get at most {door.most:.0%} of line {door.line}: its load is then "
-            f"{load + door.most:.0%}"
+            f"{load + door.most:.0%}{_spared(door)}"
         )
 
 
@@ -34,7 +34,7 @@ def door_warnings(config: Config, lines: Sequence[LineForecast]) -> list[str]:
     """Returns a sentence for each line that cannot carry its polls and its doors."""
     most: dict[str, float] = {}
     for door in _doors(config):
-        if door.protocol != RAW:
+        if door.protocol not in ALONE:
             most[door.line] = max(most.get(door.line, 0.0), door.most)
     return [
         f"line {line.name} is asked for {line.load + most[line.name]:.0%} of what it can carry "
@@ -54,6 +54,12 @@ def _written(door: Door, devices: Mapping[str, AnyDriver]) -> Iterator[str]:
     for name, spans in door.writes.items():
         if name in devices and spans:
             yield f"{name} {', '.join(_spelt(devices[name], span) for span in spans)}"
+
+
+def _spared(door: Door) -> str:
+    if not door.max_age:
+        return ""
+    return f"\n  polled addresses are answered by values of the last {door.max_age:g} s"
 
 
 def _spelt(driver: AnyDriver, span: Span) -> str:

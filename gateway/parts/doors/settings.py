@@ -15,20 +15,34 @@ from gateway.config.settings.setting_types import (
     Interval,
     Parsed,
     Text,
-    WebAddress,
 )
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Span
 from gateway.protocols.ranges import addresses
 from gateway.stations.served.registry import relatives
-from gateway.transport.port import ModemAddress, Networks, TcpAddress, is_loopback
+from gateway.transport.port import (
+    ModemAddress,
+    Networks,
+    SerialPath,
+    TcpAddress,
+    is_loopback,
+    named,
+)
 
 _PERCENT = re.compile(r"([1-9][0-9]?) ?%\Z")
+_LISTEN_SCHEMA = {"type": "string", "pattern": r"^(/.+|\[?[^\[\]/\s]+\]?:[0-9]{1,5})$"}
 _MOST_WRITTEN = 65_536  # addresses of one range
-RAW = "raw"
+RAW, RFC2217 = "raw", "rfc2217"
+ALONE = (RAW, RFC2217)  # the program has the wire alone
 LONGEST_WAIT = 10.0  # seconds
 USUAL_SHARE = 0.3  # of the wire time
+
+
+def _listens(value: object) -> TcpAddress | SerialPath:
+    if isinstance(value, str) and value.startswith("/"):
+        return SerialPath(value)
+    return TcpAddress(*parsers.web_address(value))
 
 
 def _percent(value: object) -> float:
@@ -42,11 +56,13 @@ class DoorSection(Section):
 
     line: Text
     """The name of the line."""
-    listen: WebAddress
-    """The address of the door, such as 127.0.0.1:1502."""
+    listen: Annotated[TcpAddress | SerialPath, Parsed(_listens, _LISTEN_SCHEMA)]
+    """The address of the door, such as 127.0.0.1:1502; or the path of a pseudo terminal, such as
+    /run/plc-gateway/hall-1."""
     protocol: Text
     """The frames that the programs send: modbus-tcp, modbus-rtu, modbus-ascii, vigor,
-    computer-link. raw: the program has the wire alone."""
+    computer-link. raw: the program has the wire alone. rfc2217: as raw, and it sets baud rate and
+    parity."""
     allow: Annotated[Networks | None, Parsed(parsers.networks, NETWORKS_SCHEMA)] = None
     """The addresses that may connect, such as [10.1.0.0/16]."""
     writes: dict[str, list[Text]] = {}
@@ -57,8 +73,11 @@ class DoorSection(Section):
     """The share of the wire time that the programs get; left out: 30%."""
     reply_within: Interval = 1.0
     """Requests that wait longer get no reply: the program no longer waits for one."""
+    max_age: Interval | None = None
+    """Reads of polled addresses get values of the last poll if they are no older; left out: each
+    is sent to the device."""
     idle: Interval = 60.0
-    """With raw: a program that sends nothing for so long loses the wire."""
+    """With raw and rfc2217: a program that sends nothing for so long loses the wire."""
 
 
 class ShareSection(Section):
@@ -70,17 +89,24 @@ class ShareSection(Section):
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """One checked door. `reply_within` and `idle` in seconds, `most` a share of 1."""
+    """One checked door. Times in seconds, `most` a share of 1."""
 
     name: str
     line: str
-    where: TcpAddress
+    where: TcpAddress | SerialPath
     protocol: str
     networks: Networks
     writes: Mapping[str, tuple[Span, ...]]  # by device
     most: float
     reply_within: float
     idle: float
+    max_age: float = 0.0  # seconds; 0: no value of a poll is an answer
+
+    @property
+    def listens(self) -> str:
+        """The address or the path, as in the file."""
+        where = self.where
+        return where.path if isinstance(where, SerialPath) else named(where.host, where.port)
 
     def stations(self, config: Config) -> dict[int, DeviceSettings]:
         """Returns the devices behind the door, by station number."""
@@ -104,7 +130,7 @@ class Sharing:
 def _place(settings: ShareSection | None, place: Place) -> Sharing | None:
     if settings is None:
         return None
-    found, ports = list[Door](), dict[tuple[str, int], str]()
+    found, ports = list[Door](), dict[TcpAddress | SerialPath, str]()
     for name, section in settings.doors.items():
         path: Path = ("share", "doors", name)
         other = ports.setdefault(section.listen, name)
@@ -117,10 +143,8 @@ def _place(settings: ShareSection | None, place: Place) -> Sharing | None:
 
 def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | None:
     mistakes, lines = place.mistakes, {line.name: line for line in place.lines}
-    host, port = section.listen
-    if section.allow is None and not is_loopback(host):
-        text = f"other machines can reach {host}: write the networks that may connect, such as "
-        mistakes.add((*path, "allow"), f"{text}[10.1.0.0/16], or listen on 127.0.0.1:{port}")
+    if wrong := _why_not_reached(section):
+        mistakes.add((*path, "allow"), wrong)
     if section.reply_within > LONGEST_WAIT:
         mistakes.add((*path, "reply_within"), f"at most {LONGEST_WAIT:g}s: no program waits longer")
     line = lines.get(section.line)
@@ -129,15 +153,21 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
             (*path, "line"), f"there is no line {section.line}: {meant(section.line, lines)}"
         )
         return None
-    if why := _why_not(line, raw=section.protocol == RAW):
+    if why := _why_not(line, raw=section.protocol in ALONE):
         mistakes.add((*path, "line"), f"{line.name} {why}")
         return None
     devices = {one.name: one for one in _spoken(line, section.protocol)}
-    if section.protocol == RAW and section.writes:
-        text = "a raw door passes on all that the program sends: remove `writes`"
+    if section.protocol in ALONE and section.writes:
+        text = (
+            f"a door with {section.protocol} passes on all that the program sends: remove `writes`"
+        )
         mistakes.add((*path, "writes"), text)
         return None
-    if not devices and section.protocol != RAW:
+    if section.protocol == RFC2217 and isinstance(section.listen, SerialPath):
+        text = "a terminal has its own settings, which are followed with `raw`"
+        mistakes.add((*path, "protocol"), text)
+        return None
+    if not devices and section.protocol not in ALONE:
         known = sorted({name for one in line.devices for name in relatives(one.driver.protocol)})
         text = f"its devices can be asked by {one_of(known)}" if known else "none can be asked"
         mistakes.add(
@@ -147,14 +177,26 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
     return Door(
         name,
         line.name,
-        TcpAddress(host, port),
+        section.listen,
         section.protocol,
         section.allow or (),
         _writes(section, devices, path, place),
         USUAL_SHARE if section.most is None else section.most,
         section.reply_within,
         section.idle,
+        section.max_age or 0.0,
     )
+
+
+def _why_not_reached(section: DoorSection) -> str:
+    where = section.listen
+    if isinstance(where, SerialPath):
+        text = "a terminal has no addresses: remove `allow`; those in the group dialout may open it"
+        return text if section.allow is not None else ""
+    if section.allow is not None or is_loopback(where.host):
+        return ""
+    text = f"other machines can reach {where.host}: write the networks that may connect, such as "
+    return f"{text}[10.1.0.0/16], or listen on 127.0.0.1:{where.port}"
 
 
 def _writes(

@@ -6,6 +6,7 @@ from functools import partial
 from aiohttp import web
 
 from gateway.contract import payload
+from gateway.contract.interfaces import North
 from gateway.contract.problems import Failure, Problem
 from gateway.errors import BadValue, GatewayError
 from gateway.parts.web.connections import Places
@@ -120,11 +121,16 @@ class AlarmApi:
                     return answer(503, str(error) or "this gateway keeps no history")
 
     async def _order(self, request: web.Request) -> web.Response:
-        arrived = asyncio.get_running_loop().time()
-        if request.content_type != "application/json":
-            return answer(415, "send the operator's name as Content-Type: application/json")
-        name, data = _ALARM.of(request) or "", await body(request)
-        result = await self._north.order("alarms", name, data, f"web {request[BY]}", arrived)
-        if isinstance(result, Failure):
-            return raw(payload.outcome(result), _STATUS.get(result.problem, 503))
-        return raw(result)
+        return await ordered(self._north, request, "alarms", _ALARM.of(request) or "")
+
+
+async def ordered(north: North, request: web.Request, part: str, name: str) -> web.Response:
+    """Has a part carry out the order in the body of a request, about `name`."""
+    arrived = asyncio.get_running_loop().time()
+    if request.content_type != "application/json":
+        return answer(415, "send the order as Content-Type: application/json")
+    data = await body(request)
+    result = await north.order(part, name, data, f"web {request[BY]}", arrived)
+    if isinstance(result, Failure):
+        return raw(payload.outcome(result), _STATUS.get(result.problem, 503))
+    return raw(result)

@@ -21,6 +21,7 @@ from gateway.contract.past.buckets import Now
 from gateway.contract.past.history_query import question
 from gateway.contract.problems import Problem
 from gateway.errors import BadValue, Busy, GatewayError
+from gateway.parts.web.alarms import ordered
 from gateway.parts.web.connections import Places
 from gateway.parts.web.guard import BY
 from gateway.parts.web.routes import (
@@ -72,6 +73,7 @@ _CHOSEN = Word("tags", "Only these: keys with commas, also with *; empty: those 
 _SKIP = Count("skip", "So many tags are left out before the page", 0, 10**8, 0)
 _TAG = Word("tag", "device/name", required=True)
 _WRITTEN = Word("tag", "device/name; or a device, to write several of its tags", required=True)
+_DOOR = Word("door", "Name of the door", required=True)
 # `question` parses them, as for Zenoh.
 _QUESTION = (
     Word("time", "A time range of Zenoh; [now(-1h)..] if left out: see docs/history.md"),
@@ -146,6 +148,22 @@ class Api:
                 },
             ),
             Route(
+                "/api/doors/release",
+                self._door,
+                "Disconnects the programs of a door; a raw door takes none for a minute",
+                method="post",
+                parameters=(_DOOR,),
+                body=ref("DoorRequest"),
+                reply=ref("DoorDocument"),
+                done="The programs are disconnected",
+                errors={403: "No token", 415: "No application/json"},
+                failures={
+                    400: "bad-value: another order",
+                    404: "unknown-tag: no such door",
+                    503: "busy: this gateway is the standby, or has no doors",
+                },
+            ),
+            Route(
                 "/api/write",
                 self._write,
                 "Writes one tag, or several of a device; answered when the device has acknowledged",
@@ -165,6 +183,9 @@ class Api:
                 },
             ),
         ]
+
+    async def _door(self, request: web.Request) -> web.Response:
+        return await ordered(self._north, request, "doors", _DOOR.of(request) or "")
 
     async def _status(self, _: web.Request) -> web.Response:
         return as_json(overview(await self._north.documents(STATE_AGE)))

@@ -231,6 +231,11 @@ def _state(documents: Documents) -> dict[str, Any]:
             ]
             for name, one in below("lines/", documents)
         ],
+        "doors": [
+            [name, one["line"], one["share"], [[of["address"], of["since"]] for of in programs]]
+            for name, one in below("doors/", documents)
+            if (programs := one["programs"])
+        ],
         "calls": _calls(documents),
         "transfers": {number: _transfer(one) for number, one in transfers(documents)},
         "devices": {

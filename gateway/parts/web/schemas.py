@@ -44,7 +44,10 @@ def _both(name: str, **more: Schema) -> Schema:
 
 _NEXT = _about({"type": ["string", "null"]}, "`after` of the next page; null: this was the last")
 _SAMPLE: Schema = {"anyOf": [*map(ref, ("KnownValue", "UncertainValue", "UnknownValue"))]}
-_OF_ROUTES = ("DeviceDocument", "AlarmDocument", "AcknowledgeRequest", "WrittenDocument")
+_OF_ROUTES = (
+    *("DeviceDocument", "AlarmDocument", "AcknowledgeRequest", "WrittenDocument"),
+    *("DoorDocument", "DoorRequest"),
+)
 _OWN: Mapping[str, Schema] = {
     "Error": _record({"error": TEXT}),
     "Failure": {"anyOf": [ref("FailureDocument"), ref("GroupDocument")]},

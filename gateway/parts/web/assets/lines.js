@@ -1,7 +1,7 @@
 // What is wrong, the lines with their causes, devices folded below; calls and transfers.
 
 import { byId, clock, h, keyed, put, span, style, svg } from "./dom.js";
-import { gateway, now, on } from "./stream.js";
+import { gateway, now, on, post, signedIn } from "./stream.js";
 import { wireOf } from "./wire.js";
 
 const KEPT = 360; // loads of a line: half an hour
@@ -14,6 +14,7 @@ export const devices = new Map(); // [line, state, why] by name
 const loads = new Map();
 const transfers = new Map();
 let lines = [];
+let doors = []; // with programs
 let origins = {}; // of lines without real devices
 let all = false; // every sentence is shown
 
@@ -31,6 +32,7 @@ on("state", (state) => {
   put("name", state.name);
   put("about", `plc-gateway ${state.version}, up ${span(state.up)}, ${state.tags} tags, ${state.links.length} Zenoh ${state.links.length === 1 ? "link" : "links"}, ${history}${waiting}${state.you[1] ? "" : ", read only"}`);
   lines = state.lines;
+  doors = state.doors;
   origins = state.origins;
   merge(devices, state.devices);
   merge(transfers, state.transfers);
@@ -157,6 +159,7 @@ function makeLine([name]) {
   const card = h("li", { className: "card line" });
   card.state = h("span");
   card.causes = h("ul", { className: "causes" });
+  card.doors = h("ul", { className: "causes" });
   card.chart = svg("svg", { viewBox: "0 0 360 22", preserveAspectRatio: "none", class: "load", role: "img" });
   card.chart.append(svg("polyline"));
   card.load = h("span", { className: "soft" });
@@ -165,7 +168,7 @@ function makeLine([name]) {
   card.wire = h("div");
   card.fold = h("details", { ontoggle: () => showDevices(card, name) }, card.summary, card.devices);
   card.button = h("button", { type: "button", className: "quiet", "aria-label": `wire of ${name}`, onclick: () => wireOf(name, card.wire, card.button) }, "Wire");
-  card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
+  card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, card.doors, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
   return card;
 }
 
@@ -185,6 +188,17 @@ function showLine(card, line) {
     put(item.head, rest ? `${head}: ` : head);
     put(item.rest, rest);
   });
+  keyed(card.doors, doors.filter(([, of]) => of === name), ([door]) => door, ([door]) => {
+    const item = h("li");
+    item.text = h("span");
+    item.button = h("button", { type: "button", className: "quiet write", "aria-label": `disconnect the programs of ${door}`, onclick: () => release(door, item) }, "Disconnect");
+    item.append(item.text, item.button);
+    return item;
+  }, (item, [door, , share, programs]) => {
+    const shown = programs.slice(0, SHORT).map(([address, since]) => `${address} for ${span(since)}`).join(", ");
+    const more = programs.length > SHORT ? ` and ${programs.length - SHORT} more` : "";
+    put(item.text, item.result ?? `door ${door}, ${Math.round(share * 100)} % of the wire: ${shown}${more} `);
+  });
   const known = loads.get(name) ?? [];
   const step = 360 / Math.max(60, known.length); // five minutes at least
   card.chart.firstChild.setAttribute("points", known.map((share, at) => `${360 - (known.length - 1 - at) * step},${20 - share * 18}`).join(" "));
@@ -194,6 +208,21 @@ function showLine(card, line) {
   const up = of.filter(([, [, state]]) => state === "up").length;
   put(card.summary, `${of.length} ${of.length === 1 ? "device" : "devices"}, ${up} up`);
   showDevices(card, name, of);
+}
+
+async function release(door, item) {
+  if (!(await signedIn())) return;
+  if (!item.armed) {
+    item.armed = true;
+    return put(item.button, "Confirm: disconnect");
+  }
+  try {
+    const { ok, found } = await post("doors/release", { door }, '{"do": "release"}');
+    item.result = ok ? `door ${door}: disconnected ` : `door ${door}: ${found.reason ?? found.error} `;
+  } catch {
+    item.result = `door ${door}: the connection ended; it is not known whether it was disconnected `;
+  }
+  put(item.text, item.result);
 }
 
 function showDevices(card, name, of = ownDevices(name)) {
