@@ -1,5 +1,7 @@
 """Requests in quick succession expect replies of different shapes."""
 
+from dataclasses import replace
+
 import pytest
 
 from gateway.engine.device.device import Device
@@ -355,3 +357,13 @@ def test_a_refused_longer_read_leaves_those_on_the_other_side() -> None:
     _, *others = [read for read, _ in longer.choices(span)]
     assert others
     assert all(read.start + read.size == 101 for read in others)
+
+
+def test_a_reload_keeps_what_the_device_is_silent_about() -> None:
+    dev = single()
+    for _ in range(MOST_FAILED):
+        shapes_of(dev).longer.unanswered(dev.blocks[0].span, 0.0)
+    new = dev.successor(replace(dev.settings, late_guard=0.3), dev.bad_addresses.known())
+    new.plan()
+    new.take_over(dev)
+    assert [read(shapes_of(new), new, 1.0 + 0.02 * n).size for n in range(6)] == [10] * 6

@@ -178,6 +178,7 @@ class Device:
         if (old.silence.safe, old.silence.least) == (self.silence.safe, self.silence.least):
             self.silence = old.silence
         if self.shapes is not None and old.shapes is not None:
+            self.shapes.longer.take_over(old.shapes.longer)
             old.shapes.longer, self.shapes = self.shapes.longer, old.shapes
 
     def restart(self, trouble: LineDown | None = None) -> None:

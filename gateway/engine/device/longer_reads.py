@@ -52,6 +52,10 @@ class LongerReads:
         self.alone: set[Span] = set()  # to be read without other addresses once
         self.forget_at = math.inf  # when `forget` must be called
 
+    def take_over(self, old: "LongerReads") -> None:
+        """Takes over what the same station has refused, or was silent about."""
+        self._lacking, self.failed, self.forget_at = old._lacking, old.failed, old.forget_at
+
     def choices(self, span: Span) -> list[Choice]:
         """Returns the span itself, then longer ones whose replies have other shapes."""
         found = self.by_span.get(span)

@@ -166,7 +166,7 @@ class Vigor:
         Every second resync reads inside the `spans`, if they allow it: a device that only speaks
         this protocol may lack M0 and be silent about it. An error reply names no request: it may
         be the late reply to the `outstanding` read, so one more read with another number of bytes
-        follows it, in the other place.
+        follows, in the other place.
         """
         pick = _pick(outstanding, spans)
         return await resync_by_reads(
@@ -251,12 +251,11 @@ def _pick(outstanding: Span | None, spans: Sequence[Span]) -> Callable[[int], Sp
     def pick(token: int) -> Span:
         if token == PROOF:
             return inside.proof(_PROBE_SIZES) or Span("M", 0, 8 * _PROOF_SIZE)
-        if inside:
-            step, second = divmod(token, 2)
-            token = step // 2 * 2 + second
-            if step % 2 != second:
-                return inside.pick(token)
-        return Span("M", 0, 8 * sizes[token % len(sizes)])
+        step, second = divmod(token, 2)
+        turn = step // 2 * 2 + second if inside else token
+        if inside and step % 2 != second:
+            return inside.pick(turn)
+        return Span("M", 0, 8 * sizes[turn % len(sizes)])
 
     return pick
 
