@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers contract clean sbom release bundle
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers contract docs clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -115,6 +115,11 @@ sbom: build/tools/ready
 # twice from the last commit. Fails if a bit is different.
 release: build/tools/ready
 	build/tools/bin/python -m tools.release
+
+# The pages as a site with a search, in build/site: fails at a warning, or if the search does not
+# lead a newcomer to the right page. It needs Chromium.
+docs: build/tools/ready
+	build/tools/bin/python -m tools.site
 
 # The same with an archive for fewer machines: make bundle MACHINES=armv7l PYTHONS="3.11 3.13"
 bundle: build/tools/ready

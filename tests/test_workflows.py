@@ -68,6 +68,7 @@ def test_ci_runs_the_same_as_a_developer() -> None:
     assert jobs["test"]["steps"][-1]["env"] == {"PYTHON": "python${{ matrix.python }}"}
     assert commands(jobs["archive"])[-1] == ".ci/smoke dist/*-offline.tar"
     assert commands(jobs["coverage"])[-1] == "make coverage"
+    assert commands(jobs["docs"])[-1] == "make docs"
 
 
 def test_hosted_ci_asks_whether_a_pinned_version_has_a_known_weakness() -> None:
