@@ -53,7 +53,7 @@ def read_project(text: str) -> Project | None:
     return None
 
 
-class _Loader(yaml.CSafeLoader):
+class _Loader(yaml.SafeLoader):
     """Reads `!secret x` as a text."""
 
 
