@@ -186,7 +186,7 @@ def test_a_mistake_in_a_project_names_its_tag(
     [
         '{"servermain.X": ' + 100_000 * "[",
         "[[inputs.modbus]]\nx = " + 100_000 * "[",
-        "modbus:\n" + 300_000 * "- a: b\n",
+        "modbus:\n" + 80_000 * "- a: b\n",
         "modbus: [*a]\n",
     ],
 )

@@ -19,7 +19,7 @@ from gateway.errors import ConfigError
 
 _MOST_TAGS = 100_000
 _NAMED = 5  # tags in a note
-_MOST_YAML = 2_000_000  # characters: some seconds
+_MOST_YAML = 500_000  # characters: some seconds
 _FIELD = re.compile(r"\{([^{}]+)\}")
 _COMMENT = re.compile(r"(?m)^\s*//.*$")
 _OF_LINE = ("connection", "port", "baudrate", "format", "protocol", "station", "base")
@@ -65,7 +65,7 @@ def _tree(form: str, text: str) -> object:
         return tomllib.loads(text)
     if form == "yaml":
         if len(text) > _MOST_YAML:
-            raise ConfigError(f"it has more than {_MOST_YAML // 10**6} MB")
+            raise ConfigError(f"it has more than {_MOST_YAML // 10**3} kB")
         return yaml.load(text, _Loader)  # noqa: S506  # a safe loader
     return json.loads(_COMMENT.sub("", text))
 
