@@ -163,6 +163,7 @@ def test_every_page_with_files_is_checked() -> None:
             "share.md",
             "notify.md",
             "connections.md",
+            "fx.md",
         ),
         *("modem.md", "transfers.md"),
         *("templates.md", "trace.md", "alarms.md", "arrays.md"),
@@ -279,10 +280,13 @@ def test_every_setting_of_a_section_is_on_the_page_and_no_other(heading: str, sh
     assert documented(heading) == properties(shape)
 
 
+_ALIKE = {"modbus-ascii": "modbus-rtu"}
+
+
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) -> None:
     common = documented("A device")
-    own = set(settings({"modbus-ascii": "modbus-rtu"}.get(protocol, protocol)))
+    own = set() if protocol == "fx" else set(settings(_ALIKE.get(protocol, protocol)))
     if protocol == "modbus-tcp":
         own |= set(settings("modbus-rtu"))
     assert common | own == properties(protocol)
@@ -322,7 +326,7 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
             address = "holding:1" if protocol.startswith("modbus") else "D1"
             tag["address"] = address
             device = {"protocol": protocol, "station": 1, **setting}
-            if not text and name == "station":
+            if protocol == "fx" or (not text and name == "station"):
                 del device["station"]
             if protocol == "frames":
                 fields = {"f": {"type": "text"}}

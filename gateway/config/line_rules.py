@@ -105,6 +105,9 @@ def _named(devices: Sequence[DeviceSettings]) -> str:
 def _check_stations(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
     stations: dict[tuple[str, int], str] = {}
     for device in devices:
+        if device.driver.traits.alone and len(devices) > 1:
+            text = f"{device.driver.protocol} has no station numbers: give it a line of its own"
+            mistakes.add((*path, "devices", device.name, "protocol"), text)
         if not device.driver.traits.numbered:
             continue
         protocol, number = device.driver.protocol, device.driver.station

@@ -99,6 +99,7 @@ class Traits:
     word_type: Kind = Kind.INT16  # default type of a word
     string_order: Order = Order.LOW_FIRST  # default byte order of a text
     numbered: bool = True  # devices have station numbers
+    alone: bool = False  # a line has one device: no request or reply names a station
     dissector: str = ""  # the name of the protocol in Wireshark
     no_reply_causes: str = ""  # why a device may not reply at all, in a sentence or two for people
 

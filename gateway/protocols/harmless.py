@@ -119,3 +119,32 @@ class HarmlessReads:
             if len(begin) == MOST_FORMS:
                 break
         return list(begin.values()), list((end or begin).values())
+
+
+_ODD_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # bytes: no read of words has these
+_PROOF_SIZE = 17
+
+
+def odd_reads(
+    area: str, outstanding: Span | None, spans: Sequence[Span], form: FormOf
+) -> Callable[[int], Span]:
+    """Returns the read of each probe token, for replies that differ by their number of bytes.
+
+    Every second one is inside the `spans`, if they allow it, the others read bits of the `area`
+    from 0 on: a device may lack these, and be silent about them. The second read of a resync is in
+    the other place.
+    """
+    late = None if outstanding is None else form(outstanding)
+    sizes = [size for size in _ODD_SIZES if size != late]
+    inside = HarmlessReads(spans, outstanding, form)
+
+    def pick(token: int) -> Span:
+        if token == PROOF:
+            return inside.proof(_ODD_SIZES) or Span(area, 0, 8 * _PROOF_SIZE)
+        step, second = divmod(token, 2)
+        turn = step // 2 * 2 + second if inside else token
+        if inside and step % 2 != second:
+            return inside.pick(turn)
+        return Span(area, 0, 8 * sizes[turn % len(sizes)])
+
+    return pick

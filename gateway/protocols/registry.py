@@ -13,6 +13,7 @@ from gateway.errors import ConfigError
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Addressing, AnyDriver, Driver
 from gateway.protocols.frames import FrameDriver, Frames
+from gateway.protocols.fx.driver import Fx
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 
@@ -113,4 +114,5 @@ register(ComputerLink)
 register(ModbusRtu)
 register(ModbusAscii)
 register(ModbusTcp)
+register(Fx)
 register(FrameDriver, settings=Frames)

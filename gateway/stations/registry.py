@@ -6,6 +6,7 @@ from typing import Any
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.computer_link import computer_link_station
+from gateway.stations.fx import fx_station
 from gateway.stations.modbus import modbus_station
 from gateway.stations.station import Station
 from gateway.stations.vigor import vigor_station
@@ -39,6 +40,7 @@ def station_of(driver: AnyDriver) -> Station:
 
 register("vigor", vigor_station)
 register("computer-link", computer_link_station)
+register("fx", fx_station)
 register("modbus-rtu", modbus_station)
 register("modbus-ascii", modbus_station)
 register("modbus-tcp", modbus_station)

@@ -104,12 +104,12 @@ def _carry_out(store: Store, command: str, body: bytes) -> tuple[bytes, Written]
         places = _places(body)
         if len(body) != 6:
             raise Rejected(_ASCII_ERROR)
-        return _read(store, places), ()
+        return read_stretches(store, places), ()
     if command == WRITE:
         places = _places(body)
         if len(body) != 6 + 2 * len(places):
             raise Rejected(_ASCII_ERROR)
-        return b"", _write(store, places, bytes.fromhex(body[6:].decode()))
+        return b"", write_stretches(store, places, bytes.fromhex(body[6:].decode()))
     if command not in (FORCE_ON, FORCE_OFF):
         raise Rejected(_NO_COMMAND)
     if len(body) != 4:
@@ -137,7 +137,7 @@ def _places(body: bytes) -> list[tuple[Stretch, int]]:
     return places
 
 
-def _read(store: Store, places: list[tuple[Stretch, int]]) -> bytes:
+def read_stretches(store: Store, places: list[tuple[Stretch, int]]) -> bytes:
     data, words = bytearray(), dict[Cell, int]()
     for place, byte in places:
         devices = place.devices(byte)
@@ -152,7 +152,7 @@ def _read(store: Store, places: list[tuple[Stretch, int]]) -> bytes:
     return bytes(data)
 
 
-def _write(store: Store, places: list[tuple[Stretch, int]], data: bytes) -> Written:
+def write_stretches(store: Store, places: list[tuple[Stretch, int]], data: bytes) -> Written:
     """Writes all bytes as one."""
     points: list[tuple[Cell, int]] = []
     words: dict[Cell, int] = {}

@@ -448,7 +448,7 @@ DEVICES = [
         "no protocol",
         on_mixer("station: 1"),
         f"5: {M}.protocol: missing: a device needs its protocol: "
-        "vigor, computer-link, modbus-rtu, modbus-ascii, modbus-tcp or frames",
+        "vigor, computer-link, modbus-rtu, modbus-ascii, modbus-tcp, fx or frames",
     ),
     bad(
         "unknown protocol",

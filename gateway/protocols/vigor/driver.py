@@ -10,8 +10,8 @@ from typing import ClassVar, Literal
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import PROOF, Address, Cost, Span, Talk, Timing, Traits, Unit
-from gateway.protocols.harmless import HarmlessReads, resync_by_reads
+from gateway.protocols.driver import Address, Cost, Span, Talk, Timing, Traits, Unit
+from gateway.protocols.harmless import odd_reads, resync_by_reads
 from gateway.protocols.listening import Learn, TrafficReader
 from gateway.protocols.vigor.codec import (
     FORCE_OFF,
@@ -49,8 +49,6 @@ _REFUSALS = {
 }
 _TRAITS = Traits(baudrate=19200, format="7E1", one_format=True)
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
-_PROBE_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: no read of words has these
-_PROOF_SIZE = 17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +166,7 @@ class Vigor:
         be the late reply to the `outstanding` read, so one more read with another number of bytes
         follows, in the other place.
         """
-        pick = _pick(outstanding, spans)
+        pick = odd_reads("M", outstanding, spans, _bytes)
         return await resync_by_reads(
             lambda span: self.read(talk, span), probe_token, outstanding, pick, _bytes
         )
@@ -209,7 +207,7 @@ class Vigor:
     def resync_shape(
         self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
     ) -> Hashable:
-        return _bytes(_pick(outstanding, spans)(probe_token))
+        return _bytes(odd_reads("M", outstanding, spans, _bytes)(probe_token))
 
     def is_reply(self, frame: Frame) -> bool:
         return isinstance(frame, Reply) and frame.station == self.station
@@ -240,24 +238,6 @@ def _units(data: bytes, span: Span, covered: Cover) -> Sequence[int]:
         return bits_from_bytes(data)[covered.ahead : covered.ahead + span.size]
     form = f"<{len(data) // 4}I" if unit is Unit.DWORD else f"<{len(data) // 2}H"
     return struct.unpack(form, data)  # low byte first
-
-
-def _pick(outstanding: Span | None, spans: Sequence[Span]) -> Callable[[int], Span]:
-    """Returns the read of each probe token."""
-    late = None if outstanding is None else _bytes(outstanding)
-    sizes = [size for size in _PROBE_SIZES if size != late]
-    inside = HarmlessReads(spans, outstanding, _bytes)
-
-    def pick(token: int) -> Span:
-        if token == PROOF:
-            return inside.proof(_PROBE_SIZES) or Span("M", 0, 8 * _PROOF_SIZE)
-        step, second = divmod(token, 2)
-        turn = step // 2 * 2 + second if inside else token
-        if inside and step % 2 != second:
-            return inside.pick(turn)
-        return Span("M", 0, 8 * sizes[turn % len(sizes)])
-
-    return pick
 
 
 def _bytes(span: Span) -> int | None:
