@@ -1,6 +1,6 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os.path import realpath
 from pathlib import Path as FilePath
@@ -237,8 +237,10 @@ class Builder:
         )
 
     def _check_identity(
-        self, names: Iterable[str], driver: AnyDriver, tags: Sequence[Tag], path: Path
+        self, names: Collection[str], driver: AnyDriver, tags: Sequence[Tag], path: Path
     ) -> None:
+        if not names:  # as of most devices
+            return
         own = driver.identity_names if isinstance(driver, Identifies) else ()
         areas = driver.areas
         read = [tag for tag in tags if replace(tag.origin, not_real=None) == READ and tag.polled]
