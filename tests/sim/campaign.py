@@ -18,17 +18,19 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from tests.sim import liveness, north
+from tests.sim import doors, liveness, north
 from tests.sim.draw import PACES
 from tests.sim.foreign import Case
 from tests.sim.north_clients import GROUPS
 from tests.sim.story import Story
 from tests.sim.world import run
 
-NORTH, LIVENESS = "north", "liveness"  # paces of the worlds of `north.py` and `liveness.py`
+# Paces of the worlds of `north.py`, `liveness.py` and `doors.py`.
+NORTH, LIVENESS, DOORS = "north", "liveness", "doors"
 MOST = ("most timers", "most open")  # counts of which the largest is printed
 # Counts in the total.
 WORDS = ("frames", "good samples", *(case.value for case in Case if case.value), "internal errors")
+DOOR_WORDS = ("read", "written", "value", "no reply", "wire lent", "reload")
 NORTH_WORDS = ("published", "received", "lost by congestion", "answers", "pages", "executed")
 
 
@@ -54,6 +56,8 @@ class Total:
     def __str__(self) -> str:
         broken = ", ".join(f"{rule}: {seeds}" for rule, seeds in self.rules.most_common())
         counted = WORDS if self.counts["frames"] else NORTH_WORDS
+        if self.counts["wire lent"]:
+            counted = DOOR_WORDS
         numbers = "".join(f"{self.counts[word]} {word}, " for word in counted)
         return (
             f"{self.seeds} seeds, {self.hours:g} hours, {numbers}"
@@ -88,7 +92,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=seeds, default=seeds("0-19"), metavar="0-19")
     parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--pace", choices=sorted([*PACES, NORTH, GROUPS, LIVENESS]), default="busy")
+    parser.add_argument(
+        "--pace", choices=sorted([*PACES, NORTH, GROUPS, LIVENESS, DOORS]), default="busy"
+    )
     parser.add_argument("--only", default="", help="kinds of faults, with commas")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     parser.add_argument("--part", type=part, default=(1, 1), metavar="1/4")
@@ -110,7 +116,7 @@ def main() -> int:
     began = time.monotonic()
     gc.set_threshold(100_000)
     with multiprocessing.Pool(chosen.workers, maxtasksperchild=20) as pool:
-        others = {NORTH: north.run, GROUPS: north.run, LIVENESS: liveness.run}
+        others = {NORTH: north.run, GROUPS: north.run, LIVENESS: liveness.run, DOORS: doors.story}
         run_one = others.get(chosen.pace, run)
         task = partial(run_one, hours=chosen.hours, pace=chosen.pace, only=only, traced=False)
         for story in pool.imap_unordered(task, left):

@@ -2,21 +2,21 @@
 
 Each register holds its own number, and two hold what each program wrote last. So a reply that
 belongs to another request shows itself, and so does a write that was acknowledged and not done.
-`python -m tests.sim.doors HOURS` runs seeds that nobody has run, and prints what each found.
+`make sim PACE=doors` runs seeds.
 """
 
 import asyncio
 import random
-import sys
-import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from struct import pack, unpack_from
 from typing import Any
 
 from gateway.config import LineConfig, built
 from gateway.contract.keys import Keys
+from gateway.engine.device.changes import Changes
 from gateway.line.opening import OpenPort
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
@@ -32,11 +32,11 @@ from gateway.stations.modbus.station import ModbusStation
 from gateway.tags import Quality, Sample, Tag, WriteResult
 from gateway.values import Value
 from tests.sim.bench import Bench, Unruly
+from tests.sim.story import Story
 from tests.sim.virtual import now, on_virtual_time
 
 POLLED, OWN, LAST = range(100, 140), 500, 1000  # addresses
 PATIENCE = (0.3, 0.7, 1.2)  # seconds that a program waits; `reply_within` is 1 s
-SEEDS_FROM = 1_200_000
 
 
 def _file(draw: random.Random) -> dict[str, Any]:
@@ -48,9 +48,13 @@ def _file(draw: random.Random) -> dict[str, Any]:
             "protocol": protocol,
             "writes": {"press": [f"holding:{OWN}..{OWN + 9}"]},
             "most": draw.choice(("20%", "50%", "90%")),
+            **draw.choice(({}, {"max_age": "300ms"}, {"max_age": "5s"})),
         }
         for place, protocol in enumerate(("modbus-tcp", "modbus-rtu"))
     }
+    doors["raw"] = {"line": "hall", "listen": "127.0.0.1:1502", "protocol": "raw"}
+    # What the programs write is polled too: a value from before a write is no answer to them.
+    tags |= {f"own{n}": {"address": f"holding:{n}"} for n in (OWN, OWN + 1)}
     press = {
         "protocol": "modbus-rtu",
         "station": 1,
@@ -173,6 +177,14 @@ class Program:
         return bytes(heard[1:3] if heard[1] & 0x80 else heard[1 : 1 + size])
 
 
+class Nowhere:
+    """The port of a program that reads nothing."""
+
+    def write(self, data: bytes) -> None: ...
+
+    async def close(self) -> None: ...
+
+
 class World:
     """One line with faults, its plant, and two programs."""
 
@@ -219,7 +231,7 @@ class World:
 
     def publish(self, samples: Sequence[Sample]) -> None:
         for one in samples:
-            if one.quality is Quality.GOOD:
+            if one.quality is Quality.GOOD and one.tag.span.start < OWN:
                 self.count("value")
                 self.judge(one.value == one.tag.span.start, f"{one.tag.key} became {one.value}")
 
@@ -232,14 +244,54 @@ class World:
 
     # The story
 
+    async def _reload_now_and_then(self, doors: Sequence[OpenDoor]) -> None:
+        """Changes the device of the file: its programs connect again."""
+        while True:
+            await asyncio.sleep(self.draw.choice((20.0, 200.0)))
+            [line] = self.plant.lines
+            [old] = line.engine.devices
+            guard = 0.5 + self.draw.random()
+            new = old.successor(replace(old.settings, late_guard=guard), old.bad_addresses.known())
+            new.plan()
+            applied = partial(self.plant.move, (), line, [new])
+            await line.change(Changes(replaced=[(old, new)]), (), applied)
+            for guest in [guest for door in doors for guest in door.guests]:
+                guest.leave()
+            self.count("reload")
+
+    async def _have_the_wire_now_and_then(self, door: OpenDoor) -> None:
+        """A tool that goes while the station may still answer it, or is sent away."""
+        while True:
+            await asyncio.sleep(self.draw.choice((10.0, 100.0)))
+            if (tunnel := door.connect("127.0.0.1")) is None:
+                continue  # it was released a short time ago
+            tunnel.opened(Nowhere())
+            for _ in range(self.draw.randrange(4)):
+                await asyncio.sleep(self.draw.choice((0.05, 1.0)))
+                tunnel.received(
+                    encode(Frame(1, b"\x03" + pack(">HH", self.draw.randrange(900), 1)))
+                )
+            await asyncio.sleep(self.draw.choice((0.0, 0.01, 3.0)))
+            if self.draw.random() < 0.5:
+                door.release("the judge")
+            else:
+                tunnel.lost(OSError("gone"))
+            self.count("wire lent")
+
     async def run(self, seconds: float) -> None:
         """Runs the programs for so long, while the wire has one fault after another."""
         turns = GuestRequests(self.plant.any_address, self)  # type: ignore[arg-type]
         ends = now() + seconds
         async with asyncio.TaskGroup() as tasks:
             work = [tasks.create_task(line.run()) for line in self.plant.lines]
-            for place, settings in enumerate(self.doors):
-                door = OpenDoor(settings, turns, self.plant, tasks, lambda _at, _event: None)
+            made = [
+                OpenDoor(settings, turns, self.plant, tasks, lambda _at, _event: None)
+                for settings in self.doors
+            ]
+            raw = made.pop()
+            work.append(tasks.create_task(self._reload_now_and_then(made)))
+            work.append(tasks.create_task(self._have_the_wire_now_and_then(raw)))
+            for place, (settings, door) in enumerate(zip(self.doors, made, strict=False)):
                 numbered, draw = (
                     settings.protocol == "modbus-tcp",
                     random.Random(self.draw.random()),
@@ -292,18 +344,9 @@ def run(seed: int, seconds: float) -> World:
     return worlds[0]
 
 
-def campaign(hours: float, seconds: float = 1800.0) -> Mapping[str, int]:
-    """Runs seeds until so many hours have passed in their worlds. Prints what was wrong."""
-    found, begun = Counter[str](), time.monotonic()
-    for number in range(int(hours * 3600 / seconds)):
-        world = run(SEEDS_FROM + number, seconds)
-        found += world.found
-        for one in world.wrong[:3]:
-            print(f"seed {SEEDS_FROM + number}: {one}", flush=True)
-        found["seeds with a mistake"] += bool(world.wrong)
-    print(f"{hours:g} hours, {time.monotonic() - begun:.0f} s: {dict(found)}")
-    return found
-
-
-if __name__ == "__main__":
-    campaign(float(sys.argv[1]))
+def story(
+    seed: int, hours: float, pace: str, only: Sequence[str] = (), *, traced: bool = True
+) -> Story:
+    """Runs a seed for `make sim PACE=doors`."""
+    world = run(seed, hours * 3600)
+    return Story(seed, hours, pace, tuple(only), world.wrong, world.found)

@@ -12,3 +12,5 @@ def test_no_program_and_no_tag_gets_what_belongs_to_another(seed: int) -> None:
     assert world.found["read"] > 50
     assert world.found["written"] > 20
     assert world.found["value"] > 100
+    assert world.found["wire lent"] > 0
+    assert world.found["reload"] > 0
