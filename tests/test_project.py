@@ -137,8 +137,8 @@ def test_the_contributors_table_has_the_layers_in_the_order_of_their_imports() -
         for contract in PROJECT["tool"]["importlinter"]["contracts"]
         if contract["id"] == "layers"
     ]
-    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    rows = text.partition("| folder | question")[2].partition("\n\n")[0].splitlines()[2:]
+    text = (ROOT / "docs/contributors/architecture.md").read_text("utf-8")
+    rows = text.partition("| folder or module | question")[2].partition("\n\n")[0].splitlines()[2:]
     named = [
         name.removesuffix("/").removesuffix(".py")
         for row in rows

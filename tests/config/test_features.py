@@ -1,4 +1,5 @@
-"""A new feature of tags is one module and one line in the list: nothing else names it."""
+"""A new feature of tags is one module and one line in the list. Only its fields of `@meta` have a
+type besides, and a sentence on a page."""
 
 import subprocess
 import sys
