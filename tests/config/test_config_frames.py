@@ -18,7 +18,8 @@ from tests.protocols.frames_examples import documented
 from tests.schema_check import violations
 
 FOLDER = Path(__file__).parents[2] / "examples"
-EXAMPLES = sorted(set(FOLDER.glob("*.yaml")) - {FOLDER / "panel.yaml"})  # of a served line
+OTHERS = {FOLDER / name for name in ("panel.yaml", "fx.yaml")}  # of other protocols
+EXAMPLES = sorted(set(FOLDER.glob("*.yaml")) - OTHERS)
 M = "lines.hall.devices.scale"
 
 

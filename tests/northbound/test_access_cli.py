@@ -158,7 +158,7 @@ def test_at_a_router_the_user_of_the_gateway_may_check_its_health_only(
     tmp_path: Path,
 ) -> None:
     with closed_by_a_router(tmp_path) as path:
-        while (done := typed(None, "health", path)).code:
+        while (done := typed(None, "health", path, "--json")).code:
             pass  # the router learns of the gateway
         assert json.loads(done.out)["name"] == "demo"
         done = typed(None, "read", path)
