@@ -182,8 +182,12 @@ async def test_a_terminal_is_followed_in_its_speed_and_released(tmp_path: Path) 
             return serial.Serial(str(path), 4800, stopbits=2, parity="E", timeout=PATIENCE)
 
         client = await asyncio.to_thread(opened)
-        await found.until(lambda: master.format()[1] == termios.B4800)
-        assert master.format()[0] & termios.CSTOPB
+
+        def is_followed() -> bool:
+            flags, speed = master.format()
+            return speed == termios.B4800 and bool(flags & termios.CSTOPB)
+
+        await found.until(is_followed)
         client.baudrate = 19200
         client.write(b"hello")
         await ends_with(master, b"hello")
