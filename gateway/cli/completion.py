@@ -1,4 +1,4 @@
-"""What the shell completes after Tab: names of the file that the command line has already."""
+"""Completes names of the file that the command line has already, after Tab in a shell."""
 
 import os
 from collections.abc import Callable, Iterable

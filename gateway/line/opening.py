@@ -1,4 +1,4 @@
-"""How a port is opened again: the pauses between two tries, and its loan to another program."""
+"""Opening a port again: the pauses between two tries, and its loan to another program."""
 
 import asyncio
 import random

@@ -103,7 +103,7 @@ class DeviceServerSection(Section):
 
 
 class ConnectionSection(Section):
-    """How a connection to a device server is made: docs/connections.md."""
+    """The connection to a device server: docs/connections.md."""
 
     also: list[WebAddress] = []
     """More addresses of the same device server, such as 10.1.0.7:4001: tried in turn."""

@@ -1,4 +1,4 @@
-"""Where a sheet has its titles, its tags and its devices, and how a user may change them."""
+"""The places of titles, tags and devices in a sheet, and the options of a user for them."""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a program at a raw door says: bytes for the wire, and changes of the serial port."""
+"""Reads a program at a raw door: bytes for the wire, and changes of the serial port."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol

@@ -30,7 +30,7 @@ _PORTS = {"smtps": 465, "smtp": 587, "mqtt": 1883, "mqtts": 8883, "https": 443, 
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """Where a server listens. `scheme`: the part of the address before `://`."""
+    """The address of a server. `scheme`: the part of the address before `://`."""
 
     scheme: str
     host: str
