@@ -8,7 +8,7 @@ import typer
 
 from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
 from gateway.config import load
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import ConfigError
 
 
 def notify(
@@ -21,8 +21,8 @@ def notify(
     from gateway.parts.notify.message import message
     from gateway.parts.notify.settings import NotifySection
     from gateway.parts.notify.watch import TEST
-    from gateway.parts.notify.ways import WITHIN
     from gateway.parts.notify.ways import ways as ways_of
+    from gateway.parts.notify.ways import why_not_sent
 
     loaded = load(config)
     if (settings := loaded.part(NotifySection)) is None:
@@ -35,14 +35,10 @@ def notify(
     async def send() -> list[str]:
         failed = list[str]()
         for way in ways or known:
-            try:
-                async with asyncio.timeout(WITHIN):
-                    await known[way](test)
+            if why := await why_not_sent(known[way], test):
+                failed.append(f"{way}: {why}")
+            else:
                 out.print(f"{way}: sent")
-            except TimeoutError:
-                failed.append(f"{way}: no answer within {WITHIN:g} s")
-            except GatewayError as error:
-                failed.append(f"{way}: {error}")
         return failed
 
     if failed := asyncio.run(send()):

@@ -12,12 +12,11 @@ from typing import Any
 import orjson
 import structlog
 
-from gateway.errors import GatewayError
 from gateway.parts.notify.message import Message, message
 from gateway.parts.notify.outbox import Outbox
 from gateway.parts.notify.settings import NotifySection, rules_of
 from gateway.parts.notify.watch import Alarm, Told, Watch
-from gateway.parts.notify.ways import WITHIN, ways
+from gateway.parts.notify.ways import ways, why_not_sent
 from gateway.plant.part import Core, Kind, Listed, Part
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
@@ -118,14 +117,7 @@ class NotifyPart:
                 self._filled[way].clear()
                 await self._filled[way].wait()
                 continue
-            try:
-                async with asyncio.timeout(WITHIN):
-                    await self._ways[way](waiting)
-                why = ""
-            except TimeoutError:
-                why = f"no answer within {WITHIN:g} s"
-            except GatewayError as error:
-                why = str(error)
+            why = await why_not_sent(self._ways[way], waiting)
             self._unsaved = True
             if not why:
                 box.sent(waiting, self._core.plant.wall())

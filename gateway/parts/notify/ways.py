@@ -4,6 +4,7 @@ Each sends one message, or raises a `GatewayError` that says why not. The caller
 takes longer than `WITHIN`.
 """
 
+import asyncio
 import base64
 import binascii
 import hashlib
@@ -47,6 +48,18 @@ def ways(settings: NotifySection) -> dict[str, Send]:
     """Returns the ways that the rules use, by name. Each raises `GatewayError`."""
     used = dict.fromkeys(way for rule in settings.rules for way in rule.to)
     return {way: _way(way, settings) for way in used}
+
+
+async def why_not_sent(send: Send, message: Message) -> str:
+    """Tries to send a message. Returns why it was not sent; empty: it was."""
+    try:
+        async with asyncio.timeout(WITHIN):
+            await send(message)
+    except TimeoutError:
+        return f"no answer within {WITHIN:g} s"
+    except GatewayError as error:
+        return str(error)
+    return ""
 
 
 def _way(way: str, settings: NotifySection) -> Send:
