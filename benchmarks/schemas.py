@@ -13,7 +13,6 @@ from gateway.contract.keys import CONTRACT
 
 ROOT = Path(__file__).parents[1]
 ASYNCAPI = ROOT / "docs" / "asyncapi.json"
-OF_BRIDGES = ROOT / "examples" / "bridges" / "reasons.json"
 
 
 class _Plain(GenerateJsonSchema):
@@ -99,7 +98,6 @@ def text(document: dict[str, Any]) -> str:
 def main() -> None:
     found = schema()
     FILE.write_text(text(found), "utf-8")
-    OF_BRIDGES.write_text(text(found["reasons"]), "utf-8")
     ASYNCAPI.write_text(text(asyncapi(found)), "utf-8")
 
 

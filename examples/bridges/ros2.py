@@ -1,7 +1,7 @@
 """ROS 2: values of the gateway as topics, and a service that writes.
 
     source /opt/ros/kilted/setup.bash
-    pip install eclipse-zenoh
+    pip install zenoh-plc-gateway
     python3 examples/bridges/ros2.py --connect tcp/127.0.0.1:7447
 
 The tag `mixer/speed` is the topic `/plant/mixer/speed`, of diagnostic_msgs/DiagnosticArray: a
@@ -28,6 +28,7 @@ begins with an error of docs/zenoh.md, or with `unclear`: it may or may not have
 not repeat it. No response means the same. Everyone who may call the service may then write.
 """
 
+import argparse
 import asyncio
 import json
 import re
@@ -36,12 +37,11 @@ import time
 from collections.abc import Coroutine
 from contextlib import suppress
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gateway_values import Known, Plant, bad
-from program import arguments, opened, run, say
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
@@ -49,6 +49,10 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
+
+from gateway.bridges.documents import Known, bad
+from gateway.bridges.program import Gateways, opened, run, say
+from gateway.bridges.remote_plant import RemotePlant
 
 REPEAT_EVERY = 5.0  # seconds
 LATEST = 5.0  # seconds: a write that waited longer is not sent
@@ -93,7 +97,7 @@ def message_of(key: str, known: Known, unit: str) -> DiagnosticArray:
 
 class Bridge:
     def __init__(self, node: Any, prefix: str) -> None:
-        self.plant: Plant
+        self.plant: RemotePlant
         self._node, self._prefix = node, prefix
         self._loop = asyncio.get_running_loop()
         self._keys: dict[str, str] = {}  # by topic
@@ -163,7 +167,12 @@ class Bridge:
 
 
 async def main() -> None:
-    parser = arguments(__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--connect", nargs="+", default=["tcp/127.0.0.1:7447"], metavar="ENDPOINT")
+    parser.add_argument("--zenoh", type=Path, metavar="FILE", help="a Zenoh file: user, TLS, …")
+    parser.add_argument("--prefix", default="plant", help="of the gateways (default: plant)")
     parser.add_argument("--writes", action="store_true", help="offer the service that writes")
     given = parser.parse_args()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
@@ -171,8 +180,8 @@ async def main() -> None:
     bridge = Bridge(node, given.prefix)
     spinning = threading.Thread(target=bridge.spin)
     try:
-        with await opened(given) as session:
-            bridge.plant = Plant(session, given.prefix, bridge.described, bridge.changed)
+        with await opened(Gateways(given.connect, given.zenoh, given.prefix)) as session:
+            bridge.plant = RemotePlant(session, given.prefix, bridge.described, bridge.changed)
             if given.writes:
                 node.create_service(SetParameters, topic_of(given.prefix, "set"), bridge.set)
             spinning.start()

@@ -39,6 +39,7 @@ _COMMANDS = {
     "line": "line.shared:line",
     "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",
+    "bridge": "bridge:cli",
     "notify": "notify:notify",
     "audit": "audit:audit",
     "trace": "trace:trace",

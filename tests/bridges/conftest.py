@@ -12,8 +12,8 @@ INTEROP = ROOT / "tests" / "interop"
 
 
 def bridge(name: str, *options: object) -> Program:
-    """Starts a program of examples/bridges."""
-    return Program(sys.executable, ROOT / "examples" / "bridges" / name, *options)
+    """Starts `plc-gateway bridge NAME`."""
+    return Program(sys.executable, "-m", "gateway", "bridge", name, *options)
 
 
 class Broker(Protocol):

@@ -1,4 +1,4 @@
-"""examples/bridges/influx.py with InfluxDB, and with a server that fails."""
+"""`bridge influx` with InfluxDB, and with a server that fails."""
 
 import json
 import signal
@@ -77,7 +77,7 @@ def test_influxdb_has_every_value_once_and_no_good_one_that_is_not(
         influx.query("CREATE DATABASE plant")
         with (
             PlayedGateway(endpoint, TAGS, "connect") as gateway,
-            bridge("influx.py", "--connect", endpoint, "--to", to, "--every", 0.1) as program,
+            bridge("influx", "--connect", endpoint, "--to", to, "--every", 0.1) as program,
         ):
             program.says("gateway demo is there")
             gateway.put("mixer/speed", 12.5)
@@ -144,7 +144,7 @@ def test_lost_and_refused_lines_are_counted_and_reported(tmp_path: Path) -> None
     ):
         gateway.put("mixer/speed", 0)
         options = ("--connect", endpoint, "--to", to, "--every", 0.1, "--queue", 3)
-        with bridge("influx.py", *options) as program:
+        with bridge("influx", *options) as program:
             program.says("1 lines refused")
             for value in range(1, 6):
                 gateway.put("mixer/speed", value)

@@ -1,4 +1,4 @@
-"""examples/bridges/mqtt.py with mosquitto: what a client of the broker sees, in every failure."""
+"""`bridge mqtt` with mosquitto: what a client of the broker sees, in every failure."""
 
 import signal
 import subprocess
@@ -86,7 +86,7 @@ def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
         client = Client(port)
         with client.seen as seen:
             gateway.put("mixer/speed", 12.5)
-            with bridge("mqtt.py", *options) as first:
+            with bridge("mqtt", *options) as first:
                 seen.says("plant/@bridge", "online")
                 seen.says("plant/mixer/speed", '"value": 12.5, "quality": "good"')
                 assert '"unit": "rpm"' in seen.says("plant/@meta/mixer/speed")
@@ -118,7 +118,7 @@ def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
 
             gateway.leave()  # the broker has kept good values
             after = len(seen.lines)
-            with bridge("mqtt.py", *options, "--expire", 1) as second:
+            with bridge("mqtt", *options, "--expire", 1) as second:
                 seen.says("plant/mixer/speed", '"no-gateway"', after=after)
                 seen.says("plant/oven/heat", '"no-gateway"', after=after)
                 seen.says("plant/@bridge", "online", after=after)
@@ -159,7 +159,7 @@ def test_a_command_is_written_once_and_has_its_outcome(mosquitto: Broker, tmp_pa
             return client.seen.says(f"plant/@outcome/{topic}", after=after)
 
         with client.seen as seen:
-            with bridge("mqtt.py", *options) as first:
+            with bridge("mqtt", *options) as first:
                 seen.says("plant/@bridge", "online")
                 seen.says("plant/@meta/mixer/recipe")
                 assert '"written"' in outcome("7")
@@ -187,7 +187,7 @@ def test_a_command_is_written_once_and_has_its_outcome(mosquitto: Broker, tmp_pa
             seen.says("plant/@bridge", "offline")
             gateway.answer = "written"
             after = len(seen.lines)
-            with bridge("mqtt.py", *options):
+            with bridge("mqtt", *options):
                 seen.says("plant/@bridge", "online", after=after)
                 seen.says("plant/@meta/mixer/recipe", after=after)
                 assert '"unclear"' in outcome('{"id": "b", "value": 8}', "-q", "1")
@@ -210,7 +210,7 @@ def test_a_gateway_is_seen_and_written_through_the_broker(
     options += ["--commands", str(tmp_path / "commands.db")]
     with mosquitto(port), started(file) as gateway:
         client = Client(port)
-        with client.seen as seen, bridge("mqtt.py", *options) as program:
+        with client.seen as seen, bridge("mqtt", *options) as program:
             seen.says("plant/@bridge", "online")
             seen.says("plant/mixer/recipe", '"good"')
             client.publish("@set/mixer/recipe", "7")

@@ -1,4 +1,4 @@
-"""examples/bridges/opcua.py with npm's OPC UA client: codes, times, writes, history."""
+"""`bridge opcua` with npm's OPC UA client: codes, times, writes, history."""
 
 import json
 import signal
@@ -46,7 +46,7 @@ def plant(node: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant
     options = ("--connect", endpoint, "--listen", url, "--writes")
     with (
         PlayedGateway(endpoint, TAGS) as gateway,
-        bridge("opcua.py", *options) as server,
+        bridge("opcua", *options) as server,
         Program(node, INTEROP / "opcua_client.js", folder) as client,
     ):
         server.says("listening")

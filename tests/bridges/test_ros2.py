@@ -33,7 +33,7 @@ def ros2(program: str, *options: object) -> Program:
         if sys.version_info >= (3, 14) or platform.machine() != "x86_64":
             forbidden("PyPI has no ROS 2 for this Python on this machine")
         lacking("there is no ROS 2 in build/ros2 (.ci/install-peers)")
-    return Program(*ALONE, PYTHON, ROOT / program, *options)
+    return Program(*ALONE, f"PYTHONPATH={ROOT}", PYTHON, ROOT / program, *options)
 
 
 @contextmanager

@@ -1,16 +1,17 @@
 """What each way to a user shows of a value that is no plain reading: the table of the page."""
 
-import importlib
 import json
 import re
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from gateway.bridges.documents import is_value
+from gateway.bridges.influx.bridge import line_of
+from gateway.bridges.mqtt.bridge import Bridge
+from gateway.bridges.opcua.values import Code, data_value, type_of
 from gateway.cli.history.history import _SAMPLES, _row  # a line of a CSV file, without the file
 from gateway.cli.tables import row_of, table_of
 from gateway.config import load
@@ -26,7 +27,6 @@ from gateway.tags.sample import converted
 from tests.history.recorded import EVERYTHING, NOON, SECOND, history
 
 ROOT = Path(__file__).parents[2]
-BRIDGES = ROOT / "examples" / "bridges"
 PAGE = (ROOT / "docs" / "provenance.md").read_text("utf-8")
 FILE = """
 gateway: {name: demo}
@@ -69,18 +69,7 @@ def tags(tmp_path: Path) -> dict[str, Tag]:
     return {tag.name: tag for device in devices for tag in device.tags}
 
 
-@pytest.fixture
-def bridges(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
-    """The modules of bridges: a bridge runs without the package `gateway`."""
-    monkeypatch.syspath_prepend(BRIDGES)
-    before = set(sys.modules)
-    yield {name: importlib.import_module(name) for name in ("influx", "mqtt", "opcua_values")}
-    for path in BRIDGES.glob("*.py"):
-        if path.stem not in before:
-            sys.modules.pop(path.stem, None)
-
-
-def shown(sample: Sample, folder: Path, bridges: dict[str, Any]) -> dict[str, str]:
+def shown(sample: Sample, folder: Path) -> dict[str, str]:
     """What the ways show beside the value, as the page has it."""
     tag = sample.tag
     with history(folder / f"{tag.name}-{sample.quality}.db") as historian:
@@ -101,20 +90,20 @@ def shown(sample: Sample, folder: Path, bridges: dict[str, Any]) -> dict[str, st
         "`read`, `watch`": str(quality),
         "page": _of_page(sample),
         "CSV": _about(dict(zip(names, _row(past), strict=True))),
-        "MQTT": _about(_of_mqtt(bridges["mqtt"], tag, known)),
-        "OPC UA": _of_opcua(bridges["opcua_values"], tag, known),
+        "MQTT": _about(_of_mqtt(tag, known)),
+        "OPC UA": _of_opcua(tag, known),
         "InfluxDB": ", ".join(
             part.replace('"', "").replace("=", ": ")
-            for part in re.split("[ ,]", bridges["influx"].line_of(tag.key, known))
+            for part in re.split("[ ,]", line_of(tag.key, known))
             if part.startswith(("origin", "limited", "good=false"))
         ),
     }
 
 
-def _of_opcua(opcua: Any, tag: Tag, known: dict[str, Any]) -> str:
-    code = opcua.data_value(known, opcua.type_of(meta_fields(tag))).StatusCode.value
+def _of_opcua(tag: Tag, known: dict[str, Any]) -> str:
+    code = data_value(known, type_of(meta_fields(tag))).StatusCode.value
     names = {
-        getattr(opcua.Code, name): name
+        getattr(Code, name): name
         for name in (
             *("Good", "GoodEdited", "GoodLocalOverride"),
             *("UncertainEngineeringUnitsExceeded", "BadConfigurationError"),
@@ -131,9 +120,10 @@ def _of_page(sample: Sample) -> str:
     return str(why) if quality == "good" else f"{quality}: {why}"
 
 
-def _of_mqtt(mqtt: Any, tag: Tag, known: dict[str, Any]) -> Any:
-    bridge = mqtt.Bridge("plant", expire=0, writes=False, commands="")
-    bridge.plant = SimpleNamespace(tags={tag.key: meta_fields(tag)})
+def _of_mqtt(tag: Tag, known: dict[str, Any]) -> Any:
+    bridge = Bridge("plant", expire=0, commands=None)
+    plant: Any = SimpleNamespace(tags={tag.key: meta_fields(tag)})
+    bridge.plant = plant
     bridge.changed(tag.key, known)
     [document] = bridge._retained.values()  # what the broker would get
     return json.loads(document)
@@ -145,9 +135,7 @@ def _about(document: dict[str, Any]) -> str:
     return ", ".join(found if quality == "good" else [*found, quality])
 
 
-def test_the_table_of_the_page_is_what_each_way_shows(
-    tags: dict[str, Tag], tmp_path: Path, bridges: dict[str, Any]
-) -> None:
+def test_the_table_of_the_page_is_what_each_way_shows(tags: dict[str, Tag], tmp_path: Path) -> None:
     origins = ("simulated", "replayed", "held", "computed")
     ends = {"clamped": 100, "ranged": 51, "swapped": 7}
     values = {"plain": 7, **dict.fromkeys((*origins, "counted"), 7), **ends}
@@ -158,7 +146,7 @@ def test_the_table_of_the_page_is_what_each_way_shows(
         for name, value in values.items()
         if name != "swapped"
     } | {"swapped": bad(tags["plain"], Reason.WRONG_DEVICE, NOON)}
-    found = {name: shown(sample, tmp_path, bridges) for name, sample in samples.items()}
+    found = {name: shown(sample, tmp_path) for name, sample in samples.items()}
     rows = [
         f"| {way} | {' | '.join(found[name][way] or '–' for name in columns)} |"
         for columns in (("plain", *origins), ends)
@@ -203,9 +191,8 @@ def test_a_read_outside_of_the_clamp_is_limited(tags: dict[str, Tag]) -> None:
         assert tags["clamped"].shaping.limited(known) == limited
 
 
-def test_a_bridge_takes_an_uncertain_value_only_with_its_reason(bridges: dict[str, Any]) -> None:
+def test_a_bridge_takes_an_uncertain_value_only_with_its_reason() -> None:
     known = {"value": 7, "quality": "uncertain", "time": "2026-11-20T12:00:00Z"}
-    is_value = sys.modules["gateway_values"].is_value
     assert [is_value(known | more) for more in ({}, {"reason": "out-of-range"})] == [False, True]
 
 

@@ -1,10 +1,12 @@
-"""Commands from MQTT: used by mqtt.py."""
+"""Commands from MQTT, and the file of their ids."""
 
 import json
 import sqlite3
+from pathlib import Path
 
 import aiomqtt
-from gateway_values import Known
+
+from gateway.bridges.documents import Known
 
 
 class Commands:
@@ -12,7 +14,7 @@ class Commands:
 
     KEPT = 100_000
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: Path) -> None:
         self._db = sqlite3.connect(path, isolation_level=None)
         self._db.execute(
             "CREATE TABLE IF NOT EXISTS commands"

@@ -1,8 +1,5 @@
 """InfluxDB line protocol: values of the gateway to InfluxDB, Telegraf, or the standard output.
 
-    pip install eclipse-zenoh
-    python examples/bridges/influx.py --to 'http://127.0.0.1:8086/api/v2/write?org=o&bucket=plant'
-
 `--to` is the address of a write API: InfluxDB 1 (`/write?db=plant`), 2 and 3 (with the token in
 `INFLUX_TOKEN`), VictoriaMetrics, or Telegraf's `inputs.influxdb_v2_listener`. Without it the lines
 go to the standard output, for Telegraf's `inputs.execd`.
@@ -37,8 +34,9 @@ import urllib.request
 from collections import deque
 from datetime import datetime
 
-from gateway_values import Known, Plant, utc_now
-from program import arguments, opened, run, say
+from gateway.bridges.documents import Known, utc_now
+from gateway.bridges.program import Gateways, opened, say
+from gateway.bridges.remote_plant import RemotePlant
 
 BATCH = 5000  # lines of one request
 ANSWER_WITHIN = 10.0  # seconds
@@ -156,19 +154,11 @@ class Bridge:
             pass
 
 
-async def main() -> None:
-    parser = arguments(__doc__)
-    parser.add_argument("--to", help="address of a write API; left out: the standard output")
-    parser.add_argument("--every", type=float, default=1.0, help="seconds between two requests")
-    parser.add_argument("--queue", type=int, default=500_000, help="lines that may wait")
-    given = parser.parse_args()
-    bridge = Bridge(given.to, given.every, given.queue)
-    with await opened(given) as session:
-        plant = Plant(session, given.prefix, bridge.described, bridge.changed)
+async def bridge(gateways: Gateways, to: str | None, every: float, queue: int) -> None:
+    """Serves until it is cancelled."""
+    served = Bridge(to, every, queue)
+    with await opened(gateways) as session:
+        plant = RemotePlant(session, gateways.prefix, served.described, served.changed)
         async with asyncio.TaskGroup() as group:
             group.create_task(plant.follow())
-            group.create_task(bridge.serve())
-
-
-if __name__ == "__main__":
-    run(main())
+            group.create_task(served.serve())

@@ -1,7 +1,4 @@
-"""MQTT: values of the gateway to a broker, and writes back.
-
-    pip install eclipse-zenoh aiomqtt
-    python examples/bridges/mqtt.py --connect tcp/127.0.0.1:7447 --broker mqtt://127.0.0.1:1883
+"""MQTT: values of the gateways to a broker, and writes back.
 
 | topic | retained | payload |
 |---|---|---|
@@ -37,16 +34,19 @@ import time
 from collections import deque
 from contextlib import suppress
 from itertools import islice
+from pathlib import Path
 from urllib.parse import urlsplit
 from weakref import WeakValueDictionary
 
 import aiomqtt
-from gateway_values import Known, Plant, bad
-from mqtt_commands import Commands, parsed
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
-from program import arguments, opened, run, say
+
+from gateway.bridges.documents import Known, bad
+from gateway.bridges.mqtt.commands import Commands, parsed
+from gateway.bridges.program import Gateways, opened, say
+from gateway.bridges.remote_plant import RemotePlant
 
 RECONNECT_AFTER = 1.0  # seconds
 BATCH = 100  # messages on their way to the broker
@@ -57,10 +57,10 @@ LATEST = 5.0  # seconds: a command that waited longer is not sent
 
 
 class Bridge:
-    def __init__(self, root: str, expire: int, writes: bool, commands: str) -> None:
-        self.plant: Plant
-        self._root, self._expire, self._writes = root, expire, writes
-        self._commands = Commands(commands if writes else ":memory:")
+    def __init__(self, root: str, expire: int, commands: Path | None) -> None:
+        self.plant: RemotePlant
+        self._root, self._expire = root, expire
+        self._commands = Commands(commands) if commands else None
         self._retained: dict[str, bytes] = {}  # by topic
         self._pending: dict[str, float] = {}  # changed topics, in order; since when
         self._repeats: dict[str, float] = {}  # topics to publish again before they expire
@@ -121,14 +121,15 @@ class Bridge:
         try:
             await self._clear(broker)
             self._pending |= dict.fromkeys(self._retained, time.monotonic())
-            if self._writes:
+            if self._commands:
                 options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=2)
                 await broker.subscribe(f"{self._root}/@set/#", options=options)
             await self._publish(broker)
             say("connected to the broker")
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._publish_changes(broker))
-                group.create_task(self._receive(broker))
+                if self._commands:
+                    group.create_task(self._receive(broker, self._commands))
         finally:
             with suppress(aiomqtt.MqttError):  # then the broker publishes the last will
                 await self._tell(broker, False)
@@ -158,7 +159,7 @@ class Bridge:
             await anext(broker.messages)
 
     async def _retain(self, broker: aiomqtt.Client, topic: str, payload: bytes = b"") -> None:
-        expiring = Properties(PacketTypes.PUBLISH)
+        expiring = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         expiring.MessageExpiryInterval = self._expire
         payload = payload or self._retained.get(topic, b"")
         await broker.publish(topic, payload, retain=True, properties=expiring)
@@ -190,21 +191,21 @@ class Bridge:
                 await self._publish(broker)
             self._repeats = dict.fromkeys(self._retained, 0.0)
 
-    async def _receive(self, broker: aiomqtt.Client) -> None:
+    async def _receive(self, broker: aiomqtt.Client, commands: Commands) -> None:
         async for message in broker.messages:
             if len(self._open) >= MOST_COMMANDS:
                 say(f"too many commands wait: {message.topic} is dropped")
                 continue
-            task = asyncio.create_task(self._command(message, time.monotonic()))
+            task = asyncio.create_task(self._command(commands, message, time.monotonic()))
             self._open.add(task)
             task.add_done_callback(self._open.discard)
 
-    async def _command(self, message: aiomqtt.Message, arrived: float) -> None:
+    async def _command(self, commands: Commands, message: aiomqtt.Message, arrived: float) -> None:
         key = str(message.topic).removeprefix(f"{self._root}/@set/")
         command: Known = {}
         try:
             command = parsed(message)
-            outcome = await self._outcome(key, command, arrived)
+            outcome = await self._outcome(commands, key, command, arrived)
         except ValueError as error:
             outcome = {"outcome": "bad-value", "reason": str(error)}
         except sqlite3.Error as error:
@@ -212,12 +213,11 @@ class Bridge:
         say(f"{key} = {command.get('value')}: {outcome['outcome']}")
         self._send(f"{self._root}/@outcome/{key}", {"id": command.get("id")} | outcome)
 
-    async def _outcome(self, key: str, command: Known, arrived: float) -> Known:
+    async def _outcome(self, commands: Commands, key: str, command: Known, arrived: float) -> Known:
         number, value = command.get("id"), command["value"]
         turn = self._turns.setdefault(key, asyncio.Lock())
         async with turn:  # commands to a tag in their order
-            known = number and self._commands.begin(key, number, json.dumps(value))
-            if known:
+            if number and (known := commands.begin(key, number, json.dumps(value))):
                 return known
             if key not in self.plant.tags:
                 outcome = {"outcome": "unknown-tag", "reason": "no gateway has described this tag"}
@@ -227,26 +227,17 @@ class Bridge:
                 outcome = await self.plant.write(key, value, command.get("time"))
             if number:
                 with suppress(sqlite3.Error):  # then a second delivery is `unclear`
-                    self._commands.end(key, number, outcome)
+                    commands.end(key, number, outcome)
             return outcome
 
 
-async def main() -> None:
-    parser = arguments(__doc__)
-    parser.add_argument("--broker", default="mqtt://127.0.0.1:1883", help="or mqtts://user@host")
-    parser.add_argument("--root", help="the first levels of all topics; left out: the prefix")
-    parser.add_argument("--expire", type=int, default=60, help="seconds (default: 60)")
-    parser.add_argument("--writes", action="store_true", help="accept commands")
-    parser.add_argument("--commands", default="mqtt-commands.db", help="file with their ids")
-    given = parser.parse_args()
-    with await opened(given) as session:
-        root = given.root or given.prefix
-        bridge = Bridge(root, given.expire, given.writes, given.commands)
-        bridge.plant = Plant(session, given.prefix, bridge.described, bridge.changed)
+async def bridge(
+    gateways: Gateways, broker: str, root: str | None, expire: int, commands: Path | None
+) -> None:
+    """Serves until it is cancelled. `commands`: the file with the ids of commands, or no writes."""
+    with await opened(gateways) as session:
+        served = Bridge(root or gateways.prefix, expire, commands)
+        served.plant = RemotePlant(session, gateways.prefix, served.described, served.changed)
         async with asyncio.TaskGroup() as group:
-            group.create_task(bridge.plant.follow())
-            group.create_task(bridge.serve(given.broker))
-
-
-if __name__ == "__main__":
-    run(main())
+            group.create_task(served.plant.follow())
+            group.create_task(served.serve(broker))

@@ -1,13 +1,10 @@
 """OPC UA: a server with the values of the gateway, acknowledged writes, and history.
 
-    pip install eclipse-zenoh asyncua
-    python examples/bridges/opcua.py --connect tcp/127.0.0.1:7447 --listen opc.tcp://127.0.0.1:4840
-
 * Address space: Objects / plant / a folder for each device (and for each `/` of a tag) / a variable
   for each tag: `ns=2;s=mixer/speed`, with data type, description, unit, and the limits of a write.
   An array has one dimension; a write has all of its elements.
 * Values: time and quality of the gateway as source time stamp and status code (`STATUS` in
-  opcua_values.py).
+  values.py).
 * Writes, with `--writes`: Good only after the device has acknowledged. BadTimeout: unknown, it may
   or may not have been done; read the value before you write again. Every other code: not done
   (`NOT_DONE` below). The bridge never repeats a write.
@@ -28,9 +25,11 @@ from asyncua.server import binary_server_asyncio
 from asyncua.server.address_space import AttributeService
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import nodeid_from_binary
-from gateway_values import Known, Plant
-from opcua_values import History, data_value, type_of
-from program import arguments, opened, run, say
+
+from gateway.bridges.documents import Known
+from gateway.bridges.opcua.values import History, data_value, type_of
+from gateway.bridges.program import Gateways, opened, say
+from gateway.bridges.remote_plant import RemotePlant
 
 Code = ua.StatusCodes
 NOT_DONE = {  # by the outcome of a write
@@ -69,7 +68,7 @@ class Bridge(AttributeService):
     def __init__(self, server: Server, writes: bool) -> None:
         super().__init__(server.iserver.aspace)
         server.iserver.attribute_service = self
-        self.plant: Plant
+        self.plant: RemotePlant
         self._server, self._writes, self._open = server, writes, 0
         self._space = 0
         self._types: dict[str, ua.VariantType] = {}
@@ -192,29 +191,22 @@ def _dimensions(length: int | None) -> list[tuple[ua.AttributeIds, ua.Variant]]:
     return [(ua.AttributeIds.ValueRank, rank), (ua.AttributeIds.ArrayDimensions, sizes)]
 
 
-async def main() -> None:
-    parser = arguments(__doc__)
-    parser.add_argument("--listen", default="opc.tcp://127.0.0.1:4840")
-    parser.add_argument("--writes", action="store_true", help="let clients write")
-    given = parser.parse_args()
+async def bridge(gateways: Gateways, listen: str, writes: bool) -> None:
+    """Serves until it is cancelled."""
     logging.basicConfig(level=logging.ERROR)
     binary_server_asyncio.UaProcessor = Processor
     server = Server()
-    bridge = Bridge(server, given.writes)
+    served = Bridge(server, writes)
     await server.init()
-    server.set_endpoint(given.listen)
+    server.set_endpoint(listen)
     server.set_server_name("zenoh-plc-gateway")
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     # Only these: asyncua takes a user named `admin` for its own, and lets it write all nodes.
     server.set_identity_tokens([ua.AnonymousIdentityToken])
-    with await opened(given) as session:
-        bridge.plant = Plant(session, given.prefix, bridge.described, bridge.changed)
-        server.iserver.history_manager = History(server.iserver, bridge.plant)
+    with await opened(gateways) as session:
+        served.plant = RemotePlant(session, gateways.prefix, served.described, served.changed)
+        server.iserver.history_manager = History(server.iserver, served.plant)
         async with server, asyncio.TaskGroup() as group:
-            group.create_task(bridge.serve(given.prefix))
-            group.create_task(bridge.plant.follow())
-            say(f"listening on {given.listen}")
-
-
-if __name__ == "__main__":
-    run(main())
+            group.create_task(served.serve(gateways.prefix))
+            group.create_task(served.plant.follow())
+            say(f"listening on {listen}")

@@ -1,23 +1,23 @@
-"""Values and history of the gateway as OPC UA has them: used by opcua.py."""
+"""Values and history of the gateways as OPC UA has them."""
 
 import json
 import struct
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import zenoh
 from asyncua import ua
 from asyncua.server.history import HistoryManager
 from asyncua.server.internal_server import InternalServer
 from asyncua.ua.ua_binary import variant_to_binary
-from gateway_values import Known, Plant, copied
+
+from gateway.bridges.documents import Known, copied
+from gateway.bridges.remote_plant import RemotePlant
+from gateway.contract.documents.catalogue import REASONS
 
 Code, Type = ua.StatusCodes, ua.VariantType
 
-# By the reason of a bad value; reasons.json is a part of what `@describe` of a gateway answers.
-STATUS = {
-    reason: getattr(Code, codes["opcua"])
-    for reason, codes in json.loads((Path(__file__).parent / "reasons.json").read_text()).items()
+STATUS = {  # by the reason of a bad value
+    reason.value: getattr(Code, code) for reason, (code, _) in REASONS.items()
 } | {"no-gateway": Code.BadNoCommunication}
 ORIGIN = {
     "simulated": Code.GoodEdited,
@@ -92,7 +92,7 @@ def _text(time: datetime | None) -> str:
 class History(HistoryManager):
     """Answers HistoryRead of raw values from the history of the gateway."""
 
-    def __init__(self, iserver: InternalServer, plant: Plant) -> None:
+    def __init__(self, iserver: InternalServer, plant: RemotePlant) -> None:
         super().__init__(iserver)
         self._plant = plant
 
@@ -147,7 +147,7 @@ class History(HistoryManager):
     async def _oldest_of_last(self, key: str, bounds: str, count: int) -> str:
         """Returns the bound at the oldest of the last samples: the first reply, also of a broken
         answer."""
-        for reply in await self._plant.ask(f"{key}?_time={bounds};last={count}"):
+        for reply in await self._plant.requests.ask(f"{key}?_time={bounds};last={count}"):
             if reply.ok and (known := self._plant.read(key, *copied(reply.ok)[1:])):
                 return f"[{known['time']}"
         return ""
@@ -157,7 +157,7 @@ class History(HistoryManager):
         samples: list[Known] = []
         after = ""
         while wanted is None or len(samples) < wanted:
-            replies = await self._plant.ask(
+            replies = await self._plant.requests.ask(
                 f"{key}?_time={bounds};page={wanted or MOST_SAMPLES}{after}",
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
@@ -171,7 +171,7 @@ class History(HistoryManager):
                 raise ua.uaerrors.BadCommunicationError
             if "damaged" in page:
                 raise ua.uaerrors.BadDataLost
-            read = [self._plant.read(key, *copied(sample)[1:]) for sample in found]
+            read = [self._plant.read(key, *copied(sample)[1:]) for sample in found if sample]
             samples += [known for known in read if known]
             if page["complete"]:
                 break

@@ -1,0 +1,1 @@
+"""Bridges: programs of their own between the gateways below a prefix and other systems."""

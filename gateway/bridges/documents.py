@@ -1,0 +1,66 @@
+"""The documents of values as a bridge gets them from Zenoh, checked before use."""
+
+import sys
+import time
+from datetime import datetime
+from typing import Any
+
+import orjson
+import zenoh
+
+from gateway.tags.timestamps import rfc3339
+
+Known = dict[str, Any]  # value, quality, time, and the reason of a bad value: docs/zenoh.md
+
+
+def utc_now() -> str:
+    return rfc3339(time.time_ns())
+
+
+def bad(reason: str) -> Known:
+    return {"value": None, "quality": "bad", "reason": reason, "time": utc_now()}
+
+
+def parsed(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known:
+    """Returns the document of a payload, also of a tag with `payload: raw`. A payload that is none
+    is `garbled`."""
+    try:
+        if not about:
+            known = orjson.loads(payload)
+        else:
+            is_text = meta["type"].startswith("string")
+            value = payload.decode() if is_text else orjson.loads(payload or b"null")
+            known = {"value": value if is_put else None, **orjson.loads(about)}
+        return known if is_value(known) else bad("garbled")
+    except (KeyError, TypeError, ValueError):
+        return bad("garbled")  # from another program
+
+
+def is_value(known: Any) -> bool:
+    """Checks a document. Raises KeyError, TypeError or ValueError where a field lacks."""
+    value, reason = known["value"], known.get("reason")
+    if datetime.fromisoformat(known["time"]).tzinfo is None:
+        return False
+    if known["quality"] == "bad":
+        return value is None and isinstance(reason, str)
+    if known["quality"] != "good" and not (known["quality"] == "uncertain" and reason):
+        return False
+    if isinstance(value, list):  # of an array
+        return all(map(is_number, value))
+    return is_number(value) or isinstance(value, str)
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max  # no NaN
+
+
+def copied(sample: zenoh.Sample) -> tuple[str, bool, bytes, bytes]:
+    """Returns key, put or delete, payload, attachment. (A sample keeps the batch it came in.)"""
+    about = sample.attachment
+    is_put = sample.kind == zenoh.SampleKind.PUT
+    return (
+        str(sample.key_expr),
+        is_put,
+        sample.payload.to_bytes(),
+        b"" if about is None else about.to_bytes(),
+    )

@@ -1,0 +1,1 @@
+"""The bridge to InfluxDB, Telegraf, and all that takes its line protocol."""

@@ -1,0 +1,1 @@
+"""The OPC UA server with the values of the gateways."""

@@ -1,0 +1,77 @@
+"""The session, the messages and the end of a bridge."""
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Coroutine, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+
+from gateway.errors import ConfigError
+
+
+class Gateways(NamedTuple):
+    """The gateways that a bridge serves: all below a prefix. `file`: a Zenoh file instead of
+    `connect`, with user and TLS."""
+
+    connect: Sequence[str]
+    file: Path | None
+    prefix: str
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Imports a bridge. Raises `ConfigError` where the packages of its extra are not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("gateway"):
+            raise
+        raise ConfigError(
+            f"bridge {name} needs the package {error.name}, which is not installed: "
+            f"pip install 'zenoh-plc-gateway[{name}]'"
+        ) from None
+
+
+async def opened(gateways: Gateways) -> zenoh.Session:
+    """Opens a session, and waits for a router. Zenoh reconnects an open session by itself. Raises
+    `ConfigError` for a bad file or endpoint."""
+    try:
+        if gateways.file:
+            config = zenoh.Config.from_file(gateways.file)
+        else:
+            config = zenoh.Config()
+            config.insert_json5("connect/endpoints", json.dumps(list(gateways.connect)))
+            config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
+        config.insert_json5("connect/timeout_ms", "1000")
+    except zenoh.ZError as error:
+        raise ConfigError(f"{gateways.file or ', '.join(gateways.connect)}: {error}") from None
+    while True:
+        try:
+            return await asyncio.to_thread(zenoh.open, config)
+        except zenoh.ZError as error:
+            say(f"waiting for Zenoh: {error}")
+            await asyncio.sleep(1.0)
+
+
+def run(bridge: Coroutine[Any, Any, None]) -> None:
+    """Runs it until Ctrl-C or SIGTERM, which cancel it."""
+
+    async def until_signal() -> None:
+        task = asyncio.ensure_future(bridge)
+        with suppress(NotImplementedError):  # Windows
+            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+        await task
+
+    with suppress(KeyboardInterrupt, asyncio.CancelledError):
+        asyncio.run(until_signal())

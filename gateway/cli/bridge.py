@@ -1,0 +1,84 @@
+"""The `bridge` commands: each is a program of its own between the gateways and another system."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.bridges.program import Gateways, extra, run
+
+cli = typer.Typer(help="Values to another system, and writes back.", no_args_is_help=True)
+
+_TCP = "tcp/127.0.0.1:7447"
+Connect = Annotated[
+    list[str], typer.Option(metavar="ENDPOINT", help="The gateway or its router; several: spare.")
+]
+ZenohFile = Annotated[
+    Path | None, typer.Option("--zenoh", metavar="FILE", help="A Zenoh file with user and TLS.")
+]
+Prefix = Annotated[str, typer.Option(help="zenoh.prefix of the gateways.")]
+Writes = Annotated[bool, typer.Option("--writes", help="Accept writes.")]
+
+
+@cli.callback()
+def commands() -> None:
+    """Values to another system, and writes back."""
+
+
+@cli.command()
+def opcua(
+    connect: Connect = [_TCP],  # noqa: B006  (typer does not change it)
+    zenoh: ZenohFile = None,
+    prefix: Prefix = "plant",
+    listen: Annotated[str, typer.Option(help="Address of the server.")] = (
+        "opc.tcp://127.0.0.1:4840"
+    ),
+    writes: Writes = False,
+) -> None:
+    """Serve the values to OPC UA clients, with writes and history."""
+    with extra("opcua"):
+        from gateway.bridges.opcua.bridge import bridge
+    run(bridge(Gateways(connect, zenoh, prefix), listen, writes))
+
+
+@cli.command()
+def mqtt(
+    connect: Connect = [_TCP],  # noqa: B006
+    zenoh: ZenohFile = None,
+    prefix: Prefix = "plant",
+    broker: Annotated[str, typer.Option(help="mqtt://host:port or mqtts://user@host.")] = (
+        "mqtt://127.0.0.1:1883"
+    ),
+    root: Annotated[
+        str | None, typer.Option(help="The first levels of all topics (default: the prefix).")
+    ] = None,
+    expire: Annotated[
+        int, typer.Option(help="Seconds until the broker forgets the values of a bridge that died.")
+    ] = 60,
+    writes: Writes = False,
+    commands: Annotated[Path, typer.Option(help="The file with the ids of commands.")] = (
+        Path("mqtt-commands.db")
+    ),
+) -> None:
+    """Publish the values to an MQTT broker, and take commands from it."""
+    with extra("mqtt"):
+        from gateway.bridges.mqtt.bridge import bridge
+    gateways = Gateways(connect, zenoh, prefix)
+    run(bridge(gateways, broker, root, expire, commands if writes else None))
+
+
+@cli.command()
+def influx(
+    connect: Connect = [_TCP],  # noqa: B006
+    zenoh: ZenohFile = None,
+    prefix: Prefix = "plant",
+    to: Annotated[
+        str | None, typer.Option(help="Address of a write API (default: print the lines).")
+    ] = None,
+    every: Annotated[float, typer.Option(help="Seconds between two requests.")] = 1.0,
+    queue: Annotated[int, typer.Option(help="Lines that may wait.")] = 500_000,
+) -> None:
+    """Send the values to InfluxDB, Telegraf, and what else takes their line protocol."""
+    from gateway.bridges.influx.bridge import bridge
+
+    run(bridge(Gateways(connect, zenoh, prefix), to, every, queue))
