@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench peers plant reloads pictures pins crowd parsers contract docs clean sbom release bundle
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench scenarios peers plant reloads pictures pins crowd parsers contract docs clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -39,6 +39,12 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.start
 	$(BIN)/python -m benchmarks.commands
 	$(BIN)/python -m benchmarks.northbound
+
+# The scenarios that other gateways publish, every value checked; about seven minutes. The second
+# line writes docs/scenarios.md.
+scenarios: .venv/ready
+	$(BIN)/python -m benchmarks.scenarios --json benchmarks/results/scenarios.json
+	$(BIN)/python -m benchmarks.scenarios --docs
 
 # Reloads under load: memory, missed polls, what is left over.
 reloads: .venv/ready

@@ -1,5 +1,6 @@
 """Every benchmark runs to its end at a tiny size, and prints its figures."""
 
+import json
 import re
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import scenario_clients, scenarios
 from tests.conftest import needs
 from tests.e2e.processes import ROOT
 
@@ -102,8 +104,21 @@ TINY = [
     ),
 ]
 PICTURES = ["pictures", "--after", "0", "--sizes", "phone", "--schemes", "light", "--into"]
-BY_OTHER_TESTS = {"moves", "structure", "schemas", "contract_reader"}  # test_structure, _schemas
-PARTS_OF_OTHERS = {"__init__", "checkouts", "paced_wire", "plant_consumer", "words"}
+BY_OTHER_TESTS = {
+    "moves",
+    "structure",
+    "schemas",
+    "contract_reader",
+    "scenarios",
+}  # test_structure, _schemas
+PARTS_OF_OTHERS = {
+    "__init__",
+    "checkouts",
+    "paced_wire",
+    "plant_consumer",
+    "scenario_clients",
+    "words",
+}
 
 
 def printed(program: str, *arguments: str) -> str:
@@ -123,6 +138,32 @@ def test_a_benchmark_prints_its_figures(program: str, arguments: str, figures: l
 def test_the_pictures_of_the_page_are_made(tmp_path: Path) -> None:
     printed(*PICTURES, str(tmp_path), "--chromium", needs("chromium"))
     assert [path for path in tmp_path.iterdir() if path.suffix == ".png"]
+
+
+def test_the_scenarios_check_every_value(tmp_path: Path) -> None:
+    needs("cc")
+    result = tmp_path / "result.json"
+    sizes = ["--sizes", "1", "1", "4", "0.1", "--values", "change"]
+    brief = ["--seconds", "0.3", "--settle", "0.3", "--json", str(result)]
+    text = printed("scenarios", *sizes, *brief)
+    assert re.search(r"^\| 4 at 100 ms \(1 × 1 × 4\) \| change", text, re.MULTILINE)
+    (one,) = json.loads(result.read_text())["scenarios"]
+    values = one["values"]
+    assert values["arrived"] + values["missing"] == values["read"] > 0
+    assert values["arrived"] > 0
+    assert values["wrong"] == values["out of order"] == one["writes"]["lost"] == 0
+
+
+def test_the_page_has_the_kept_scenarios() -> None:
+    assert scenarios.table(json.loads(scenarios.RESULTS.read_text())) in scenarios.PAGE.read_text()
+
+
+def test_the_consumer_finds_what_is_wrong() -> None:
+    token = 5 << 14 | 1234
+    right = token ^ (1234 * 40503 & 0xFFFF) << 16
+    assert scenario_clients.in_uint32(right, 5) == 1234
+    assert scenario_clients.in_uint32(right, 6) is None
+    assert scenario_clients.in_uint32(right + 1, 5) is None  # halves of two replies
 
 
 def test_every_benchmark_is_run() -> None:
