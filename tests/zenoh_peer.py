@@ -23,6 +23,7 @@ base64. It ends with its standard input.
 """
 
 import asyncio
+import atexit
 import base64
 import itertools
 import json
@@ -32,6 +33,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -45,19 +47,31 @@ ANSWER_WITHIN = 20.0  # seconds for the replies to one query
 BARRIER = "*/@gateway/*/status"
 
 
-# Ports below those that the system gives to connections; each worker of the tests has its own.
-FIRST_PORT, PORTS = 12_000, 5_000
-_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 4
-_numbers = itertools.count(os.getpid())
+# Ports below those that the system gives to connections. Each process of the tests has a block of
+# its own, beside those of another run on this machine: it keeps the first port of the block.
+FIRST_PORT, BLOCK, BLOCKS = 12_000, 400, 50
+
+
+@cache
+def _own_ports() -> "itertools.cycle[int]":
+    """Returns the ports of this process, again and again."""
+    for number in range(os.getpid(), os.getpid() + BLOCKS):
+        first = FIRST_PORT + number % BLOCKS * BLOCK
+        claim = socket.socket()
+        atexit.register(claim.close)
+        with suppress(OSError):
+            claim.bind(("127.0.0.1", first))
+            return itertools.cycle(range(first + 1, first + BLOCK))
+    raise AssertionError("every block of ports belongs to another process")
 
 
 def free_port() -> int:
     """Returns a free port of the loopback that this process has not used recently."""
-    while True:
-        port = FIRST_PORT + PORTS * _WORKER + next(_numbers) % PORTS
+    for port in _own_ports():
         with socket.socket() as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))
             return port
+    raise AssertionError("the ports never end")
 
 
 def free_endpoint() -> str:

@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 from tests.e2e.processes import started, write_config
-from tests.interop.peers import HERE, free_port, running
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.interop.peers import HERE, running
+from tests.zenoh_peer import ZenohPeer, free_endpoint, free_port
 
 WRITE = {"max": 60000, "verify": True}
 TAGS = {

@@ -1,7 +1,6 @@
 """Programs nobody here wrote, as processes: how they are started, and what joins them to us."""
 
 import asyncio
-import socket
 from asyncio.subprocess import PIPE, Process
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -48,10 +47,3 @@ async def pty_pair(folder: Path) -> AsyncIterator[tuple[Path, Path]]:
     ends = [f"pty,raw,echo=0,link={end}" for end in (ours, theirs)]
     async with running("socat", "-d", "-d", *ends, ready=b"starting data transfer loop"):
         yield ours, theirs
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

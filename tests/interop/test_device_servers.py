@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 from tests.e2e.processes import PATIENCE, Program, plc_gateway, started, write_config
-from tests.interop.peers import HERE, free_port, running
-from tests.zenoh_peer import free_endpoint
+from tests.interop.peers import HERE, running
+from tests.zenoh_peer import free_endpoint, free_port
 
 
 async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -12,8 +12,8 @@ from pymodbus.client import AsyncModbusTcpClient
 from gateway.parts.audit.file import checked, read
 from tests.conftest import needs
 from tests.e2e.processes import plc_gateway, started, write_config
-from tests.interop.peers import HERE, finished, free_port, pty_pair, running
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.interop.peers import HERE, finished, pty_pair, running
+from tests.zenoh_peer import ZenohPeer, free_endpoint, free_port
 
 POLLED = 60  # tags
 

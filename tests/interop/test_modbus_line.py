@@ -18,11 +18,11 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.tags import Quality, Reason, WriteRule
 from gateway.transport import Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from tests.e2e.processes import plc_gateway, write_config
-from tests.interop.peers import HERE, free_port, pty_pair, running
+from tests.interop.peers import HERE, pty_pair, running
 from tests.sim.bench import Bench
 from tests.sim.plant import Plant, made_device, make_tag
 from tests.sim.plant import running as serving
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import free_endpoint, free_port
 
 Where = SerialPath | TcpAddress
 Peer = Callable[[pytest.FixtureRequest, Path], AbstractAsyncContextManager[Where]]

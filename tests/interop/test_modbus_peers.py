@@ -26,7 +26,8 @@ from tests.interop.modbus_wire import (
     station_on_tcp,
     tcp_end,
 )
-from tests.interop.peers import HERE, finished, free_port, pty_pair, running
+from tests.interop.peers import HERE, finished, pty_pair, running
+from tests.zenoh_peer import free_port
 
 NPM = pytest.mark.usefixtures("modbus_serial")
 SOCAT = pytest.mark.usefixtures("socat")

@@ -18,9 +18,9 @@ from gateway.contract.access.certificates import role
 from gateway.errors import ConfigError
 from gateway.parts.serving.served_line import ServedLine
 from gateway.tags import Quality, good
-from tests.interop.peers import free_port
 from tests.interop.test_served_lines import ACCEPT, TAGS, Plant
 from tests.transport.authority import Authority
+from tests.zenoh_peer import free_port
 
 
 class SecureClient(AsyncModbusTcpClient):

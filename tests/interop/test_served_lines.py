@@ -15,7 +15,8 @@ from gateway.stations.served.registers import ServedTag
 from gateway.stations.served.station import ServedStation
 from gateway.tags import Sample, good
 from tests.conftest import needs
-from tests.interop.peers import finished, free_port, pty_pair
+from tests.interop.peers import finished, pty_pair
+from tests.zenoh_peer import free_port
 
 TAGS = {
     "seen": {"address": "holding:10", "type": "int32", "write": True},

@@ -15,9 +15,9 @@ from gateway.plant.plant import Plant
 from gateway.tags import Quality, Reason, Tag, WriteResult
 from gateway.transport import TcpAddress, listen
 from gateway.values import Value
-from tests.interop.peers import free_port
 from tests.parts.made import parts_of
 from tests.writing import write
+from tests.zenoh_peer import free_port
 
 TAGS = {
     "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
