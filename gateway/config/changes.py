@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+from pydantic import BaseModel
+
 from gateway.config.settings.records import Config, LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.tags import Tag
@@ -145,11 +147,12 @@ def _changed(old: Any, new: Any, prefix: str, left_out: set[str]) -> Iterator[st
 def _of_parts(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
     """Yields the settings of parts that changed."""
     for name in dict.fromkeys((*old, *new)):
-        before, after = dict(old.get(name, ())), dict(new.get(name, ()))
-        if not (before and after):
+        before, after = old.get(name), new.get(name)
+        if isinstance(before, BaseModel) and isinstance(after, type(before)):
+            names = dict(after)
+            yield from (f"{name}.{one}" for one in names if dict(before)[one] != names[one])
+        elif before != after:
             yield name
-            continue
-        yield from (f"{name}.{one}" for one in after if before[one] != after[one])
 
 
 def compare(old: Config, new: Config) -> Difference:

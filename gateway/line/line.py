@@ -171,14 +171,15 @@ class Line:
         bad meanwhile, requests are refused. `why`: who has it. Raises `LineDown`."""
         if isinstance(self._open_port, Loan):
             raise LineDown("another program has the wire")
-        lent = self._open_port = Loan(self._open_port, why)
+        lent = self._open_port = Loan(self._open_port, why, receiver)
         self.lost(Lent(why))
         await lent.left.wait()
         return await lent.opens(receiver)
 
-    def take_back(self) -> None:
-        """Has the line open its port again. What the program asked may still be answered."""
-        if isinstance(lent := self._open_port, Loan):
+    def take_back(self, holder: Receiver) -> None:
+        """Has the line open its port again, if `holder` has it: its `receiver` when it was lent.
+        What the program asked may still be answered."""
+        if isinstance(lent := self._open_port, Loan) and lent.holder is holder:
             self._open_port = lent.opens
             lent.over.set()
             self.engine.inherits()

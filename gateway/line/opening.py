@@ -35,9 +35,10 @@ class Pauses:
 class Loan:
     """Takes the place of the opener of a line: the line is down, and tries again and again."""
 
-    def __init__(self, opens: OpenPort, why: str) -> None:
+    def __init__(self, opens: OpenPort, why: str, holder: Receiver) -> None:
         """`why`: who has the port, in one sentence."""
         self.opens = opens
+        self.holder = holder
         self.left = asyncio.Event()  # the line has closed the port
         self.over = asyncio.Event()
         self._why = why

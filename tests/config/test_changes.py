@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.config import built, load
+from gateway.config import Config, built, load
 from gateway.config.changes import compare, needs_restart
 from tests.reload.plant import Data, file, vigor
 
@@ -53,6 +53,32 @@ def test_a_line_that_answers_needs_a_restart() -> None:
     assert not compare(old, same)
     assert needs_restart(old, new) == ["lines.panel"]
     assert needs_restart(old, built(data())) == ["lines.panel"]
+
+
+@pytest.mark.parametrize(
+    ("name", "one", "other", "changed"),
+    [
+        ("share", {"doors": {"tool": {"max_age": "1s"}}}, {"doors": {"tool": {}}}, "share"),
+        ("share", {"doors": {"tool": {}}}, None, "share"),
+        ("share", None, {"doors": {"tool": {}}}, "share"),
+        ("history", {"keep": "1d"}, {"keep": "2d"}, "history.keep"),
+        ("alarms", {"path": "a.json"}, {"path": "b.json"}, "alarms.path"),
+        ("web", {"listen": "127.0.0.1:1"}, {"listen": "127.0.0.1:2"}, "web.listen"),
+        ("web", {"listen": "127.0.0.1:1"}, None, "web"),
+    ],
+)
+def test_a_changed_section_of_a_part_needs_a_restart(
+    name: str, one: Data | None, other: Data | None, changed: str
+) -> None:
+    """A reload with other doors ended the process."""
+
+    def made(section: Data | None) -> Config:
+        document = data() if section is None else {**data(), name: section}
+        for door in document.get("share", {}).get("doors", {}).values():
+            door |= {"line": "hall", "listen": "127.0.0.1:1502", "protocol": "vigor"}
+        return built(document)
+
+    assert needs_restart(made(one), made(other)) == [changed]
 
 
 def data(**tag: object) -> Data:

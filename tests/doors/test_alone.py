@@ -46,7 +46,7 @@ class Hall:
 
     @property
     def open(self) -> bool:
-        return self.door.line.engine.is_open
+        return self.door.line is not None and self.door.line.engine.is_open
 
 
 @asynccontextmanager

@@ -8,15 +8,17 @@ from itertools import pairwise
 from struct import pack
 from typing import Any, NoReturn
 
+import orjson
 import pytest
 
 from gateway.config import built
 from gateway.config.messages import ConfigErrors
 from gateway.contract.keys import Keys
+from gateway.errors import Refused
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.doors.guest import MOST_WAITING, Guest
-from gateway.parts.doors.guest_requests import GuestRequests
+from gateway.parts.doors.guest_requests import NO_REPLY, GuestRequests
 from gateway.parts.doors.open_door import HELD, OpenDoor
 from gateway.parts.doors.plan import door_plans, door_warnings
 from gateway.parts.doors.repeated_reads import MOST_KEPT, RepeatedReads
@@ -28,6 +30,7 @@ from gateway.plant.plant import Plant
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.rtu import encode
+from gateway.stations.store import Rejected
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 from tests.serving.easy_link import frame as vigor_frame
@@ -110,16 +113,19 @@ def _end() -> NoReturn:
 
 @dataclass(eq=False)
 class Hall:
-    """The plant, and its only door."""
+    """The plant, its door `laptop`, and the second door."""
 
     plant: Plant
     door: OpenDoor
     outcomes: list[bytes]
+    second: OpenDoor | None = None
 
 
 @asynccontextmanager
-async def opened(settings: dict[str, Any], lines: Any = LINES) -> AsyncIterator[Hall]:
-    config = built({"lines": lines, "share": {"doors": {"laptop": settings}}})
+async def opened(
+    settings: dict[str, Any], lines: Any = LINES, **second: dict[str, Any]
+) -> AsyncIterator[Hall]:
+    config = built({"lines": lines, "share": {"doors": {"laptop": settings, **second}}})
     plant = Plant(config, lambda: int(now() * 1e9))
     outcomes: list[bytes] = []
     own = OwnWrites(Keys("plant", "demo"), plant, Audit(outcomes.append))
@@ -138,12 +144,12 @@ async def opened(settings: dict[str, Any], lines: Any = LINES) -> AsyncIterator[
     north: Any = North()
     try:
         async with asyncio.TaskGroup() as tasks:
-            [one] = sharing.doors
-            made = OpenDoor(one, GuestRequests(plant.any_address, north), plant, tasks, keep)
+            asks = GuestRequests(plant.any_address, north)
+            made = [OpenDoor(one, asks, plant, tasks, keep) for one in sharing.doors]
             for line in plant.lines:
                 tasks.create_task(line.run())
             await asyncio.sleep(2)
-            yield Hall(plant, made, outcomes)
+            yield Hall(plant, made[0], outcomes, made[-1])
             _end()
     except* _End:
         pass
@@ -202,6 +208,44 @@ async def test_requests_behind_one_another_are_answered_in_their_order() -> None
         told = [tcp("03 02 0000", 1), tcp("06 000a 0005", 2), tcp("03 02 0005", 3)]
         assert answer == b"".join(told)
         assert await program.ask(tcp("03 000a 0001", 4, station=9)) == tcp("83 0a", 4, station=9)
+
+
+@on_virtual_time
+async def test_each_of_several_requests_in_one_packet_is_done() -> None:
+    """They were joined to one: of a pulse only its end was written, and both were acknowledged."""
+    async with opened(door("hall", "modbus-tcp", writes=WRITES, most="99%")) as hall:
+        program = Program(hall.door)
+        pulse = tcp("05 0003 ff00", 1), tcp("05 0003 0000", 2)
+        assert await program.ask(b"".join(pulse)) == b"".join(pulse)
+        values = [orjson.loads(outcome)["value"] for outcome in hall.outcomes]
+        assert values == [True, False]
+        asked = [tcp("06 000b 0001", 3), tcp("06 00ff 0007", 4), tcp("06 000a 0002", 5)]
+        told = [asked[0], tcp("86 02", 4), asked[2]]
+        assert await program.ask(b"".join(asked)) == b"".join(told)
+        keys = [orjson.loads(outcome)["key"] for outcome in hall.outcomes[2:]]
+        assert [key.rpartition("-")[2] for key in keys] == ["11", "10"]
+
+
+@on_virtual_time
+async def test_a_request_that_is_done_in_part_is_not_refused() -> None:
+    """The first register is written, the device refuses the second: NAK means that nothing is."""
+    async with opened(door("link", "computer-link", writes={"mixer": ["D0..D99"]})) as hall:
+        done = list[Tag]()
+
+        class Refuses:
+            async def write_own(self, tag: Tag, value: Value, *_: Any, **_how: Any) -> WriteResult:
+                if done:
+                    raise Refused("there is no D20", code="06")
+                done.append(tag)
+                return WriteResult(value, 0, 0.0)
+
+        north: Any = Refuses()
+        asks, step = GuestRequests(hall.plant.any_address, north), Step("mixer", writes=True)
+        step.cells |= {("D", 10): 1, ("D", 20): 2}
+        assert await asks.carry_out(step, hall.door.settings, "a test", 1.0) is NO_REPLY
+        again = await asks.carry_out(step, hall.door.settings, "a test", 1.0)
+        assert isinstance(again, Rejected)  # nothing was done this time
+        assert again.code == "06"
 
 
 @on_virtual_time
@@ -351,6 +395,36 @@ async def test_the_wire_comes_back_when_the_program_goes() -> None:
         await asyncio.sleep(15)
         assert quality(hall) == ("good", None)
         assert hall.door.document(now())["programs"] == []
+
+
+@on_virtual_time
+async def test_the_program_of_another_door_does_not_take_the_wire_from_the_first() -> None:
+    """Its end gave the wire back to the line: program and gateway were two masters on it."""
+    async with opened(door("hall", "raw"), two=door("hall", "raw", listen="127.0.0.1:2")) as hall:
+        first = Program(hall.door)
+        assert await first.ask(rtu("03 000a 0001")) == rtu("03 02 0000")
+        assert hall.second is not None
+        second = Program(hall.second)
+        assert await second.ask(rtu("03 000a 0001"), wait=30.0) == b""
+        assert second.closed
+        assert quality(hall) == ("bad", "maintenance")
+        assert await first.ask(rtu("03 000a 0001")) == rtu("03 02 0000")
+        first.guest.lost(OSError("gone"))
+        await asyncio.sleep(15)
+        assert quality(hall) == ("good", None)
+
+
+@on_virtual_time
+async def test_a_door_whose_devices_belong_to_another_gateway_is_closed() -> None:
+    """The part of all doors failed, again and again: no door of the file was open."""
+    async with opened(door("hall", "modbus-tcp")) as hall:
+        config, plant = hall.plant.config, hall.plant
+        plant.move(["press"], plant.lines[0])
+        plant.lines[:] = [line for line in plant.lines if line.name != "hall"]
+        hall.door.take_over(config.without(["press"]), plant)
+        assert hall.door.connect("127.0.0.1") is None
+        why = "other gateways have the devices of line hall"
+        assert hall.door.document(now())["trouble"] == why
 
 
 @on_virtual_time

@@ -5,7 +5,7 @@ import json
 import socket
 import ssl
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from email import message_from_bytes
 from email.policy import default
 from pathlib import Path
@@ -238,3 +238,24 @@ def test_a_command_that_does_not_end_is_killed_with_its_children(
     if file.exists():  # a slow machine may not have come so far
         child = Path(f"/proc/{file.read_text().strip() or 0}/cmdline")
         until(lambda: not child.exists() or child.read_bytes() == b"", "the child ends")
+
+
+@pytest.mark.parametrize("more", [b"250-and more\r\n" * 300, b"2" * 4000], ids=["lines", "line"])
+async def test_a_mail_server_whose_reply_has_no_end_costs_no_memory(
+    tmp_path: Path, more: bytes
+) -> None:
+    """The thread read it for ever: 4 GB in 40 s."""
+
+    async def answer(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"220 mail.plant\r\n")
+        with suppress(ConnectionError):
+            while not writer.is_closing():
+                writer.write(more)
+                await writer.drain()
+
+    server = await asyncio.start_server(answer, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    known = {"from": "a@b.example", "to": ["c@d.example"]}
+    async with server, asyncio.timeout(300):
+        with pytest.raises(GatewayError, match=r"no end|too long"):
+            await way(tmp_path, "mail", server=f"smtp://127.0.0.1:{port}", **known)(SENT)

@@ -65,7 +65,12 @@ class Bench:
         return heard
 
     def ask(self, data: bytes, *, after: float = 1.0) -> bytes:
-        return self.hear(data, after=after).reply
+        heard = self.hear(data, after=after)
+        reply = heard.reply
+        while heard.more:
+            heard = self.hear(b"", after=0.0)
+            reply += heard.reply
+        return reply
 
     def hex(self, text: str, *, after: float = 1.0) -> str:
         """As `ask`, in hex."""

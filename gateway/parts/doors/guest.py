@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
+from gateway.line.line import Line
 from gateway.parts.doors.guest_requests import NOT_NOW, Unanswered
 from gateway.parts.doors.stores import Needs, Outcomes, Step
 from gateway.stations.served.answering import Heard
@@ -26,7 +27,7 @@ class Guest:
     reply to its next request.
     """
 
-    def __init__(self, door: "OpenDoor", address: str) -> None:
+    def __init__(self, door: "OpenDoor", line: Line, address: str) -> None:
         self._door = door
         self._address = address
         self._since = asyncio.get_running_loop().time()
@@ -34,8 +35,10 @@ class Guest:
         self._steps: list[Step] = []
         devices = door.devices
         self._outcomes = {one.name: Outcomes() for one in devices.values()}
-        self._asks = door.machine({n: Needs(one.name, self._steps) for n, one in devices.items()})
-        self._tells = door.machine({n: self._outcomes[one.name] for n, one in devices.items()})
+        needs = {number: Needs(one.name, self._steps) for number, one in devices.items()}
+        self._asks = door.machine(line, needs)
+        told = {number: self._outcomes[one.name] for number, one in devices.items()}
+        self._tells = door.machine(line, told)
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._arrived = asyncio.Event()
         self._port: Port | None = None
@@ -79,18 +82,21 @@ class Guest:
             at, data = self._waiting.popleft()
             if not self._waiting:
                 self._arrived.clear()
-            lost = self._asks.hear(data, at).lost
-            steps = [*self._steps]
-            self._steps.clear()
-            answered = await self._carry_out(steps, at)
-            told = self._tells.hear(data, at)
-            for outcome in self._outcomes.values():
-                outcome.forget()
-            self._count(told)
-            if told.reply:
-                await self._reply(told, at, answered=answered)
-            if lost:
-                self.leave()
+            more = True
+            while more:
+                self._asks.hear(data, at)
+                steps = [*self._steps]
+                self._steps.clear()
+                answered = await self._carry_out(steps, at)
+                told = self._tells.hear(data, at)
+                for outcome in self._outcomes.values():
+                    outcome.forget()
+                self._count(told)
+                if told.reply:
+                    await self._reply(told, at, answered=answered)
+                if told.lost:
+                    self.leave()
+                more, data = told.more, b""
 
     async def _carry_out(self, steps: Sequence[Step], at: float) -> bool:
         """Returns False if a device did not reply, or was not asked."""

@@ -91,18 +91,23 @@ class GuestRequests:
     async def _write(self, step: Step, door: Door, by: str, within: float) -> Outcome:
         if not all(door.may_write(step.device, *cell) for cell in step.cells):
             return Denied(Why.NOT_ACCEPTED)
-        runs = [*step.runs()]
+        runs, done = [*step.runs()], 0
         tags = [self._any.target(step.device, run) for run in runs]  # before the first is sent
+        values = [tag.from_units(step.units(run)) for run, tag in zip(runs, tags, strict=True)]
         try:
-            for run, tag in zip(runs, tags, strict=True):
+            for tag, value in zip(tags, values, strict=True):
+                if value is None or None in values:
+                    return Denied(Why.BAD)
                 _, device = self._any.place(step.device)
-                value = tag.from_units(step.units(run))
-                if value is None:
-                    return Denied(Why.BAD)
                 self._spend(write_seconds(device, tag), door.most)
-                done = await self._north.write_own(tag, value, by, within, repeated=False)
-                if done.value != value:  # the device took another one
-                    return Denied(Why.BAD)
+                took = await self._north.write_own(tag, value, by, within, repeated=False)
+                if took.value != value:  # the device took another one
+                    return NO_REPLY if done else Denied(Why.BAD)
+                done += 1
+        except GatewayError:
+            if done:  # a refusal would say that nothing was
+                return NO_REPLY
+            raise
         finally:
             self._any.refresh(step.device, runs)
         return {}

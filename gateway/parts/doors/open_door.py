@@ -50,19 +50,30 @@ class OpenDoor:
         self.settings = settings
         self.turns = turns
         self._audit = audit
-        self.line = self._line(plant)
         self.reads = RepeatedReads()
         self.guests: set[Guest | Tunnel] = set()
-        self.devices: Mapping[int, DeviceSettings] = settings.stations(plant.config)  # by station
-        self.serial = _serial(plant.config, settings.line)
+        self.devices: Mapping[int, DeviceSettings] = {}  # by station
+        self.line: Line | None = None  # while all its devices belong to other gateways
+        self.serial = SerialSettings()
+        self._place(plant.config, plant)
         self._duty = plant.duty
         self._tasks = tasks
         self._trouble = ""
         self._turned_away = 0
         self._held_until = 0.0  # by the loop's clock: after a release no program gets the wire
 
-    def _line(self, plant: Plant) -> Line:
-        return next(one for one in plant.lines if one.name == self.settings.line)
+    def _place(self, config: Config, plant: Plant) -> None:
+        lines = {line.name: line for line in plant.lines}
+        self.line, self.devices = lines.get(self.settings.line), {}
+        for line in config.lines:
+            if line.name == self.settings.line and self.line is not None:
+                self.devices, self.serial = self.settings.stations(config), line.serial
+
+    @property
+    def trouble(self) -> str:
+        """Why no program is served; empty: it is open."""
+        elsewhere = f"other gateways have the devices of line {self.settings.line}"
+        return self._trouble or (elsewhere if self.line is None else "")
 
     @property
     def numbered(self) -> bool:
@@ -90,13 +101,13 @@ class OpenDoor:
             await asyncio.sleep(pauses.take())
 
     def connect(self, address: str) -> Guest | Tunnel | None:
-        raw, networks = self.settings.protocol in ALONE, self.settings.networks
+        raw, networks, line = self.settings.protocol in ALONE, self.settings.networks, self.line
         held = raw and (self.guests or asyncio.get_running_loop().time() < self._held_until)
-        if held or (networks and not allows(networks, address)):
+        if held or line is None or (networks and not allows(networks, address)):
             self._turned_away += 1
             log.debug("turned away", door=self.settings.name, address=address)
             return None
-        return Tunnel(self, address) if raw else Guest(self, address)
+        return Tunnel(self, line, address) if raw else Guest(self, line, address)
 
     def start(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         return self._tasks.create_task(work)
@@ -105,21 +116,20 @@ class OpenDoor:
         """Returns the reason to answer nothing now; empty: none."""
         return self._duty.why_not(now, now)
 
-    def machine(self, stores: Mapping[int, Store]) -> Answerer:
+    def machine(self, line: Line, stores: Mapping[int, Store]) -> Answerer:
         """Returns an answering machine over these stores, by station number."""
         stations = {
             number: Answering(self.devices[number].driver, store)
             for number, store in stores.items()
         }
-        wire = Wire(character=self.line.engine.wire.character, echo=Echo(told=False))
+        wire = Wire(character=line.engine.wire.character, echo=Echo(told=False))
         return answerer(self.settings.protocol, stations, wire)
 
     def take_over(self, config: Config, plant: Plant) -> None:
         """Takes over a changed file. Programs connect again if their devices are others now."""
-        devices, line = self.settings.stations(config), self._line(plant)
-        self.serial = _serial(config, self.settings.line)
+        devices, line = self.devices, self.line
+        self._place(config, plant)
         if devices != self.devices or line is not self.line:
-            self.devices, self.line = devices, line
             for guest in [*self.guests]:
                 guest.leave()
 
@@ -153,14 +163,10 @@ class OpenDoor:
             "line": settings.line,
             "listen": settings.listens,
             "protocol": settings.protocol,
-            "trouble": self._trouble,
+            "trouble": self.trouble,
             "most": settings.most,
             "share": round(self.turns.share(now), 4),
             "turned_away": self._turned_away,
             "programs": [guest.document(now) for guest in [*self.guests]],
             "reads": self.reads.documents({one.name: one for one in self.devices.values()}),
         }
-
-
-def _serial(config: Config, name: str) -> SerialSettings:
-    return next(line.serial for line in config.lines if line.name == name)

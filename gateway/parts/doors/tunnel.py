@@ -9,6 +9,7 @@ import structlog
 
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
+from gateway.line.line import Line
 from gateway.parts.doors.com_port import DRAINS, Change, ComPort, Item, Plain, Reply, Speech
 from gateway.parts.doors.guest import MOST_WAITING, guest_document
 from gateway.parts.doors.settings import RFC2217
@@ -37,9 +38,10 @@ class Tunnel:
     when an operator releases the line.
     """
 
-    def __init__(self, door: "OpenDoor", address: str) -> None:
+    def __init__(self, door: "OpenDoor", line: Line, address: str) -> None:
         self._door = door
-        self._line = door.line
+        self._line = line
+        self._ear = _Ear(self)
         self._address = address
         self._since = asyncio.get_running_loop().time()
         self._speech: Speech = ComPort() if door.settings.protocol == RFC2217 else Plain()
@@ -105,7 +107,7 @@ class Tunnel:
         looks = None
         try:
             async with asyncio.timeout(HAND_OVER):
-                self._wire = await line.lend(f"{name} ({self._address}) has the wire", _Ear(self))
+                self._wire = await line.lend(f"{name} ({self._address}) has the wire", self._ear)
             log.warning("wire lent", line=line.name, door=name, address=self._address)
             if loop.time() - self._since > OLD:
                 old = [item for item in self._items if isinstance(item, bytes)]
@@ -174,7 +176,7 @@ class Tunnel:
                 if port is not None:
                     await port.close()
         finally:
-            self._line.take_back()
+            self._line.take_back(self._ear)
             if wire is not None:
                 what = (
                     f"it had the wire, and sent {self._bytes} bytes; {self._why or 'it has gone'}"

@@ -12,9 +12,11 @@ import hmac
 import os
 import signal
 import smtplib
+import socket
 import ssl
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -40,6 +42,7 @@ from gateway.plant.threads import off_loop
 WITHIN = 30.0  # seconds for one try
 COMMAND_WITHIN = 25.0  # seconds
 _STEP_WITHIN = 10.0  # seconds for each answer of a mail server
+_MOST_REPLIES = 65_536  # bytes of one connection to a mail server
 
 Send = Callable[[Message], Coroutine[Any, Any, None]]
 
@@ -95,6 +98,40 @@ class _Blocking:
             self._busy.release()
 
 
+class _Replies:
+    """The replies of a mail server, as the file that smtplib reads: bounded in bytes and time. A
+    reply of many lines may have no end, or a line may arrive byte by byte."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._heard, self._bytes = b"", 0
+        self._ends = time.monotonic() + WITHIN
+
+    def readline(self, _most: int) -> bytes:
+        while b"\n" not in self._heard:
+            if self._bytes > _MOST_REPLIES or time.monotonic() > self._ends:
+                raise OSError("its reply has no end")
+            if not (data := self._connection.recv(4096)):
+                return b""
+            self._heard, self._bytes = self._heard + data, self._bytes + len(data)
+        line, _, self._heard = self._heard.partition(b"\n")
+        return line + b"\n"
+
+    def close(self) -> None:
+        """The connection is smtplib's."""
+
+
+class _Server(smtplib.SMTP):
+    def getreply(self) -> tuple[int, bytes]:
+        if self.file is None and self.sock is not None:
+            self.file = _Replies(self.sock)
+        return super().getreply()
+
+
+class _TlsServer(_Server, smtplib.SMTP_SSL):
+    pass
+
+
 class _Mail:
     def __init__(self, settings: MailSection, to: Sequence[str]) -> None:
         self._settings = settings
@@ -115,8 +152,8 @@ class _Mail:
     def _connected(self, at: Server) -> smtplib.SMTP:
         if at.scheme == "smtps":
             context = _trusted(self._settings.ca)
-            return smtplib.SMTP_SSL(at.host, at.port, timeout=_STEP_WITHIN, context=context)
-        server = smtplib.SMTP(at.host, at.port, timeout=_STEP_WITHIN)
+            return _TlsServer(at.host, at.port, timeout=_STEP_WITHIN, context=context)
+        server = _Server(at.host, at.port, timeout=_STEP_WITHIN)
         try:
             server.ehlo()
             if server.has_extn("starttls") or not at.is_local:

@@ -4,7 +4,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from gateway.errors import CallEnded, LineDown
-from gateway.stations.served.answering import NOISE
+from gateway.stations.served.answering import NOISE, Heard
 from gateway.transport import Port
 
 if TYPE_CHECKING:
@@ -43,6 +43,12 @@ class Conversation:
         if self._following > NOISE:
             self._cancel()
         heard = self._machine.hear(data, now)
+        while heard.more:
+            self._take(heard, now)
+            heard = self._machine.hear(b"", now)
+        self._take(heard, now)
+
+    def _take(self, heard: Heard, now: float) -> None:
         if heard.reply:
             self._following = 0
             if heard.delay:
@@ -50,7 +56,7 @@ class Conversation:
                 self._reply = loop.call_at(now + heard.delay, self._send, heard.reply)
             else:
                 self._send(heard.reply)
-        line.take(heard, now)
+        self._line.take(heard, now)
         if heard.lost:
             self._begin_again()
 

@@ -30,6 +30,7 @@ class Heard(NamedTuple):
     done: tuple[Done, ...] = ()
     stale: int = 0  # requests that later bytes have followed: neither carried out nor answered
     lost: bool = False  # where the next frame begins cannot be found any more
+    more: bool = False  # another request waits: hear no bytes for it
 
 
 SILENCE = Heard()
@@ -44,7 +45,8 @@ class Answerer(Protocol):
     """
 
     def hear(self, data: bytes, now: float) -> Heard:
-        """Takes any piece of the bytes on the wire. `now`: seconds, by any clock."""
+        """Takes any piece of the bytes on the wire, and carries out one request at most. `now`:
+        seconds, by any clock."""
 
 
 class Answering(NamedTuple):

@@ -1,5 +1,7 @@
 """Modbus on the wire, on the side of served stations: TCP connections, RTU and ASCII lines."""
 
+from collections import deque
+
 from gateway.errors import Garbled
 from gateway.protocols.checksums import crc16
 from gateway.protocols.modbus import AsciiCodec, Frame, MbapCodec
@@ -48,7 +50,8 @@ class _Station:
 
 
 class _Tcp:
-    """The stations behind one TCP connection. Every request has a number: all are answered."""
+    """The stations behind one TCP connection. Every request has a number: all are answered, one
+    after another."""
 
     def __init__(self, stations: Stations) -> None:
         self._stations = {number: _Station(one) for number, one in stations.items()}
@@ -56,22 +59,25 @@ class _Tcp:
             (only,) = self._stations.values()
             self._stations |= {unit: only for unit in _ANY_UNIT if unit not in self._stations}
         self._codec = MbapCodec()
+        self._waiting = deque[Frame]()
 
     def hear(self, data: bytes, now: float) -> Heard:
-        reply, done = b"", list[Done]()
+        waiting, done = self._waiting, tuple[Done, ...]()
         try:
-            while frames := self._codec.feed(data):
-                data = b""
-                for unit, pdu, number in frames:
-                    answer = bytes((pdu[0] | EXCEPTION, _NO_PATH))
-                    if (station := self._stations.get(unit)) is not None:
-                        answer, did = station.answer(pdu)
-                        done.append(did)
-                    reply += self._codec.encode(Frame(unit, answer, number))
+            waiting += self._codec.feed(data)
         except Garbled:
-            self._codec = MbapCodec()
-            return Heard(reply, 0.0, tuple(done), lost=True)
-        return Heard(reply, 0.0, tuple(done))
+            if not waiting:
+                self._codec = MbapCodec()
+                return Heard(lost=True)
+        if not waiting:
+            return SILENCE
+        unit, pdu, number = waiting.popleft()
+        answer = bytes((pdu[0] | EXCEPTION, _NO_PATH))
+        if (station := self._stations.get(unit)) is not None:
+            answer, did = station.answer(pdu)
+            done = (did,)
+        reply = self._codec.encode(Frame(unit, answer, number))
+        return Heard(reply, 0.0, done, more=True)
 
 
 class _Serial:
