@@ -11,38 +11,29 @@ import hashlib
 import hmac
 import os
 import signal
-import smtplib
-import socket
 import ssl
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
-from email.message import EmailMessage
-from email.utils import format_datetime
-from pathlib import Path
 from typing import Any
 
 import orjson
 
-from gateway.contract.access.secrets import readable_secret
 from gateway.errors import ConfigError, GatewayError
+from gateway.parts.notify.answers import first_line, said, trusted
+from gateway.parts.notify.mail import Mail
 from gateway.parts.notify.message import Message
 from gateway.parts.notify.settings import (
-    MailSection,
     MqttSection,
     NotifySection,
-    Server,
     WebhookSection,
 )
 from gateway.plant.threads import off_loop
 
 WITHIN = 30.0  # seconds for one try
 COMMAND_WITHIN = 25.0  # seconds
-_STEP_WITHIN = 10.0  # seconds for each answer of a mail server
-_MOST_REPLIES = 65_536  # bytes of one connection to a mail server
 
 Send = Callable[[Message], Coroutine[Any, Any, None]]
 
@@ -75,7 +66,7 @@ def _way(way: str, settings: NotifySection) -> Send:
     if settings.mail is None:
         raise ConfigError(f"notify: there is no {way}")
     to = settings.mail.to if way == "mail" else [way]
-    return _Blocking(_Mail(settings.mail, to).send).send
+    return _Blocking(Mail(settings.mail, to).send).send
 
 
 class _Blocking:
@@ -96,83 +87,6 @@ class _Blocking:
             self._send(message)
         finally:
             self._busy.release()
-
-
-class _Replies:
-    """The replies of a mail server, as the file that smtplib reads: bounded in bytes and time. A
-    reply of many lines may have no end, or a line may arrive byte by byte."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self._connection = connection
-        self._heard, self._bytes = b"", 0
-        self._ends = time.monotonic() + WITHIN
-
-    def readline(self, _most: int) -> bytes:
-        while b"\n" not in self._heard:
-            if self._bytes > _MOST_REPLIES or time.monotonic() > self._ends:
-                raise OSError("its reply has no end")
-            if not (data := self._connection.recv(4096)):
-                return b""
-            self._heard, self._bytes = self._heard + data, self._bytes + len(data)
-        line, _, self._heard = self._heard.partition(b"\n")
-        return line + b"\n"
-
-    def close(self) -> None:
-        """The connection is smtplib's."""
-
-
-class _Server(smtplib.SMTP):
-    def getreply(self) -> tuple[int, bytes]:
-        if self.file is None and self.sock is not None:
-            self.file = _Replies(self.sock)
-        return super().getreply()
-
-
-class _TlsServer(_Server, smtplib.SMTP_SSL):
-    pass
-
-
-class _Mail:
-    def __init__(self, settings: MailSection, to: Sequence[str]) -> None:
-        self._settings = settings
-        self._to = to
-
-    def send(self, message: Message) -> None:
-        settings = self._settings
-        try:
-            with self._connected(settings.server) as server:
-                if settings.user and settings.password_file:
-                    server.login(settings.user, _first_line(settings.password_file, "mail"))
-                server.send_message(_mail(message, settings.from_, self._to))
-        except smtplib.SMTPRecipientsRefused as error:
-            raise GatewayError(f"the server refuses {', '.join(error.recipients)}") from None
-        except (OSError, smtplib.SMTPException, ValueError) as error:
-            raise GatewayError(_said(error)) from None
-
-    def _connected(self, at: Server) -> smtplib.SMTP:
-        if at.scheme == "smtps":
-            context = _trusted(self._settings.ca)
-            return _TlsServer(at.host, at.port, timeout=_STEP_WITHIN, context=context)
-        server = _Server(at.host, at.port, timeout=_STEP_WITHIN)
-        try:
-            server.ehlo()
-            if server.has_extn("starttls") or not at.is_local:
-                server.starttls(context=_trusted(self._settings.ca))
-        except (OSError, smtplib.SMTPException, ValueError):
-            server.close()
-            raise
-        return server
-
-
-def _mail(message: Message, sender: str, to: Sequence[str]) -> EmailMessage:
-    mail = EmailMessage()
-    mail["From"], mail["To"] = sender, ", ".join(to)
-    mail["Subject"] = "".join(c if c.isprintable() else " " for c in message.subject)
-    mail["Date"] = format_datetime(datetime.fromtimestamp(message.time / 1e9, UTC))
-    mail["Message-ID"] = f"<{message.id}@{sender.partition('@')[2]}>"
-    mail["Auto-Submitted"] = "auto-generated"  # no reply of a machine, please
-    mail.set_content(message.text)
-    return mail
 
 
 class _Webhook:
@@ -199,7 +113,7 @@ class _Webhook:
                 if not 200 <= answer.status < 300:
                     raise GatewayError(f"the server answers {answer.status} {answer.reason}")
         except (aiohttp.ClientError, OSError, ValueError) as error:
-            raise GatewayError(_said(error)) from None
+            raise GatewayError(said(error)) from None
 
     def _prepare(self, message: Message) -> tuple[bytes, dict[str, str], ssl.SSLContext | bool]:
         """Blocks: it reads files."""
@@ -212,9 +126,9 @@ class _Webhook:
             "webhook-timestamp": sent,
         }
         if settings.secret_file is not None:
-            secret = _first_line(settings.secret_file, "webhook")
+            secret = first_line(settings.secret_file, "webhook")
             headers["webhook-signature"] = signature(secret, f"{message.id}.{sent}.", body)
-        return body, headers, _trusted(settings.ca) if settings.url.scheme == "https" else True
+        return body, headers, trusted(settings.ca) if settings.url.scheme == "https" else True
 
 
 def signature(secret: str, begin: str, body: bytes) -> str:
@@ -253,15 +167,15 @@ class _Mqtt:
             ) as client:
                 await client.publish(settings.topic, orjson.dumps(message.document), qos=1)
         except (self._library.MqttError, OSError, ValueError) as error:
-            raise GatewayError(_said(error)) from None
+            raise GatewayError(said(error)) from None
 
     def _prepare(self) -> tuple[str | None, ssl.SSLContext | None]:
         """Blocks: it reads files."""
         settings = self._settings
         file = settings.password_file
-        password = None if file is None else _first_line(file, "mqtt")
+        password = None if file is None else first_line(file, "mqtt")
         is_tls = settings.broker.scheme == "mqtts"
-        return password, _trusted(settings.ca) if is_tls else None
+        return password, trusted(settings.ca) if is_tls else None
 
 
 class _Command:
@@ -278,7 +192,7 @@ class _Command:
                 start_new_session=True,
             )
         except (OSError, ValueError) as error:
-            raise GatewayError(f"{self._command[0]}: {_said(error)}") from None
+            raise GatewayError(f"{self._command[0]}: {said(error)}") from None
         with process:
             try:
                 process.communicate(orjson.dumps(message.document), timeout=COMMAND_WITHIN)
@@ -288,31 +202,3 @@ class _Command:
                 raise GatewayError(f"{self._command[0]} has not ended: killed") from None
         if process.returncode != 0:
             raise GatewayError(f"{self._command[0]} ended with {process.returncode}")
-
-
-def _first_line(path: Path, way: str) -> str:
-    """Returns a secret. Blocks."""
-    try:
-        return readable_secret(path, f"notify.{way}").partition("\n")[0].strip()
-    except ConfigError as error:
-        raise GatewayError(str(error)) from None
-
-
-def _trusted(ca: Path | None) -> ssl.SSLContext:
-    """Raises `GatewayError`. Blocks."""
-    try:
-        return ssl.create_default_context(cafile=ca)
-    except (OSError, ValueError) as error:
-        raise GatewayError(f"{ca}: {_said(error)}") from None
-
-
-def _said(error: Exception) -> str:
-    """Returns one sentence. A server may answer anything."""
-    if isinstance(error, smtplib.SMTPResponseException):
-        reply = error.smtp_error
-        said = reply.decode(errors="replace") if isinstance(reply, bytes) else reply
-        text = f"the server answers {error.smtp_code} {said}"
-    else:
-        text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
-    text = " ".join(text.split())
-    return "".join(c if c.isprintable() else "?" for c in text)[:200]

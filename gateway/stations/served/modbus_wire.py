@@ -50,8 +50,7 @@ class _Station:
 
 
 class _Tcp:
-    """The stations behind one TCP connection. Every request has a number: all are answered, one
-    after another."""
+    """The stations behind one TCP connection. Every request has a number: all are answered."""
 
     def __init__(self, stations: Stations) -> None:
         self._stations = {number: _Station(one) for number, one in stations.items()}
@@ -62,22 +61,20 @@ class _Tcp:
         self._waiting = deque[Frame]()
 
     def hear(self, data: bytes, now: float) -> Heard:
-        waiting, done = self._waiting, tuple[Done, ...]()
+        waiting, answer, done = self._waiting, b"", tuple[Done, ...]()
         try:
             waiting += self._codec.feed(data)
         except Garbled:
             if not waiting:
-                self._codec = MbapCodec()
                 return Heard(lost=True)
         if not waiting:
             return SILENCE
         unit, pdu, number = waiting.popleft()
-        answer = bytes((pdu[0] | EXCEPTION, _NO_PATH))
         if (station := self._stations.get(unit)) is not None:
             answer, did = station.answer(pdu)
             done = (did,)
-        reply = self._codec.encode(Frame(unit, answer, number))
-        return Heard(reply, 0.0, done, more=True)
+        answer = answer or bytes((pdu[0] | EXCEPTION, _NO_PATH))
+        return Heard(self._codec.encode(Frame(unit, answer, number)), 0.0, done, more=True)
 
 
 class _Serial:
