@@ -739,7 +739,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
 
 def page_of(document: str) -> str:
     """The page with the fields of a status document."""
-    pages = {"`doors": "share.md", "`notify": "notify.md"}
+    pages = {"`doors": "share.md", "`notify": "notify.md", "`report`": "fleet.md"}
     return pages.get(document.partition("/")[0], "status.md")
 
 

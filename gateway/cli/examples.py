@@ -24,6 +24,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "simulate": ("plant.yaml --tcp 127.0.0.1:5020", "plant.yaml --links /tmp/plant"),
     "status": ("plant.yaml --watch", "plant.yaml --json"),
     "health": ("plant.yaml", "plant.yaml --strict"),
+    "fleet": ("works --connect tcp/router:7447", "works --folder files --remember seen.json"),
     "line": ("plant.yaml hall-1", "plant.yaml hall-1 release"),
     "doctor": ("plant.yaml", "plant.yaml --json"),
     "alarms": ("plant.yaml", "plant.yaml --ack mixer/level --by ana"),

@@ -36,6 +36,7 @@ _COMMANDS = {
     "simulate": "line.simulate:simulate",
     "status": "status:status",
     "health": "status:health",
+    "fleet": "fleet:fleet",
     "line": "line.shared:line",
     "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",

@@ -12,7 +12,8 @@ from gateway.tags import Tag
 
 # Parts of a configuration that a reload takes over. All others need a restart.
 _TAKEN_OVER = {"lines", "sheets", "transfers", "watch"}
-_DERIVED = {"folder", "writers_state"}  # from the place of the file, and from `writers_file`
+# From the place of the file, from `writers_file`, and from all settings.
+_DERIVED = {"folder", "writers_state", "digest"}
 # Settings of a tag that do not change the meaning of its value. After a change of any other one
 # the value begins again.
 _HARMLESS = {"every", "description", "deadband", "publish", "heartbeat", "history"}

@@ -1,9 +1,12 @@
 """Loads the file: reads it, expands its templates, checks it as a whole, and the files it names."""
 
 import gc
+import hashlib
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from pathlib import Path as FilePath
@@ -21,6 +24,7 @@ from gateway.config.templates.expand import expanded
 from gateway.config.yaml.file import TEXTS, read_yaml
 from gateway.config.yaml.scalars import scalar
 
+_DIGITS = 16  # of a digest
 STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
 
 
@@ -40,13 +44,23 @@ def load(
     with _without_gc():
         file, mistakes = read_yaml(Path(path), TEXTS, read)
         builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
-        config = builder.config(expanded(file, mistakes, Path(path).parent))
+        data = expanded(file, mistakes, Path(path).parent)
+        config = builder.config(data)
         if config is not None:
             check_files(config, Path(path), mistakes)
+            config = replace(config, digest=digest(data, config))
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")
     return config
+
+
+def digest(data: Mapping[str, Any], config: Config) -> str:
+    """Returns a digest of all settings of a file, of its templates and its sheets, without comments
+    and layout: files of one digest make gateways that do the same."""
+    content = [data, *(sheet.raw for sheet in config.sheets)]
+    packed = json.dumps(content, default=str)
+    return hashlib.sha256(packed.encode()).hexdigest()[:_DIGITS]
 
 
 def expanded_text(path: str | Path) -> str:

@@ -2,12 +2,15 @@
 
 import re
 from collections.abc import Iterator, Mapping
+from datetime import datetime
 from typing import Any
 
-from gateway.contract.line_faults import device_warnings, line_fault, stands_by
+from gateway.contract.line_faults import Fault, device_warnings, line_fault, stands_by
 
 JUMP_SHOWN = 3600.0  # seconds
 DAYS_LEFT = 30  # of a certificate
+_KEPT_TO_TELL = 0.04  # days of history: an hour
+DAYS_OF_DISK = 14  # left for history
 ALARM_STATES = ("normal", "active", "acknowledged", "returned", "shelved", "out_of_service")
 ROWS_SHOWN = 10  # numbers of transfers in one sentence
 Document = Mapping[str, Any]
@@ -15,6 +18,11 @@ Documents = Mapping[str, Document]  # by path: `status`, `lines/hall-1`, `device
 
 
 def faults(documents: Documents) -> Iterator[str]:
+    """Yields what needs a person, as sentences."""
+    return (one.text for one in coded_faults(documents))
+
+
+def coded_faults(documents: Documents) -> Iterator[Fault]:
     """Yields what needs a person: lines that are down, silent devices, transfers that do not
     work, a lost router, a stopped part, history not written."""
     if not stands_by(documents):
@@ -23,43 +31,48 @@ def faults(documents: Documents) -> Iterator[str]:
     unreachable = _unreachable(documents)
     for number, row in transfers(documents):
         if _fails(row) and not _waits_for(row, unreachable, documents):
-            yield (
-                f"transfer {number} ({row['from']} to {row['to']}) is {row['state']}: {row['why']}"
-            )
+            which = f"transfer {number} ({row['from']} to {row['to']})"
+            yield Fault("transfer", f"{which} is {row['state']}: {row['why']}")
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
-        yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
+        where = " or ".join(wanted)
+        yield Fault("no-router", f"Zenoh: not connected to {where}: its clients get no values")
     yield from _of_parts(documents)
     for setting, document in below("certificates/", documents):
         called = setting if "." in setting else f"zenoh.tls.{setting}"
         if wrong := certificate_fault(called, document):
-            yield wrong
+            yield Fault("certificate", wrong)
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
-        yield f"history: {history['state']}"
+        yield Fault("history", f"history: {history['state']}")
     if aside := history.get("aside"):
-        yield f"history: {aside[0]} was moved aside: see `plc-gateway history salvage` and `known`"
+        what = f"{aside[0]} was moved aside: see `plc-gateway history salvage` and `known`"
+        yield Fault("history", f"history: {what}")
 
 
-def _of_parts(documents: Documents) -> Iterator[str]:
+def _of_parts(documents: Documents) -> Iterator[Fault]:
     for part, document in below("parts/", documents):
         if document["why"]:
-            yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
+            again = f"it is tried again in {document['again']} s"
+            yield Fault("part-stopped", f"{part} stopped: {document['why']}; {again}")
     for file in documents.get("damaged", {"files": ()})["files"]:
-        yield (
+        yield Fault(
+            "damaged-file",
             f"{file} is a damaged file that was moved aside, and what it held is forgotten: remove "
-            "or rename it when you know"
+            "or rename it when you know",
         )
     for door, document in below("doors/", documents):
         if document["trouble"]:
-            yield f"door {door} to line {document['line']} is closed: {document['trouble']}"
+            which = f"door {door} to line {document['line']}"
+            yield Fault("door-closed", f"{which} is closed: {document['trouble']}")
     for way, document in below("notify/", documents):
         if document["trouble"]:
-            wait = f"{document['waiting']} messages about alarms wait"
-            yield f"{way} does not work: {document['trouble']}; {wait} since {document['oldest']}"
+            wait = f"{document['waiting']} messages about alarms wait since {document['oldest']}"
+            yield Fault("notify", f"{way} does not work: {document['trouble']}; {wait}")
     for part, document in below("files/", documents):
         if document["trouble"]:
-            yield f"{part} not saved: {document['trouble']}; a restart forgets the last changes"
+            effect = "a restart forgets the last changes"
+            yield Fault("not-saved", f"{part} not saved: {document['trouble']}; {effect}")
 
 
 def certificate_fault(setting: str, document: Document) -> str:
@@ -109,6 +122,20 @@ def warnings(documents: Documents) -> Iterator[str]:
         )
     if lost := documents.get("history", {}).get("lost"):
         yield f"history: {lost} samples were lost since the start"
+    if (days := disk_days(documents)) is not None and days < DAYS_OF_DISK:
+        yield f"history: its disk is full in {days:.1f} days: make room, or a smaller `max_size`"
+
+
+def disk_days(documents: Documents) -> float | None:
+    """Returns in how many days the disk of history is full, if it grows as it did. None: it is not
+    known yet, or the file reaches its largest size before."""
+    history = documents.get("history", {})
+    free, oldest = history.get("free"), history.get("oldest")
+    if free is None or oldest is None or free >= history["room"]:
+        return None
+    now = datetime.fromisoformat(documents["status"]["time"])
+    kept = (now - datetime.fromisoformat(oldest)).total_seconds() / 86400
+    return float(free / history["bytes"] * kept) if kept > _KEPT_TO_TELL else None
 
 
 def _of_others(status: Document) -> Iterator[str]:
@@ -129,7 +156,7 @@ def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:
         devices = _devices_of(document, documents)
         wrong = () if stands_by(documents) else line_fault(line, document, devices)
         told = device_warnings(line, [one for one in devices if one[0] not in unreachable])
-        found[line] = [*wrong], [*told]
+        found[line] = [one.text for one in wrong], [*told]
     return found
 
 

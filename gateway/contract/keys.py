@@ -136,6 +136,11 @@ class Keys:
         return f"{self.own}/**"
 
     @property
+    def reports(self) -> str:
+        """The reports of all gateways under the prefix, and under prefixes below it."""
+        return f"{self.prefix}/**/@gateway/*/report"
+
+    @property
     def describe(self) -> str:
         """The JSON Schema of every document. No wildcard matches it, nor the next one."""
         return f"{self.own}/@describe"

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 NAMES_SHOWN = 5
 # Words of `failures` in the documents of devices.
@@ -20,33 +20,42 @@ Document = Mapping[str, Any]
 Named = tuple[str, Document]
 
 
+class Fault(NamedTuple):
+    """What needs a person. Programs count by `code`, people read `text`."""
+
+    code: str
+    text: str
+
+
 def stands_by(documents: Mapping[str, Document]) -> bool:
     """The gateway is a healthy standby: another one has its lines open."""
     stand: str = documents.get("standby", {}).get("stand", "active")
     return stand != "active"
 
 
-def line_fault(line: str, document: Document, devices: Sequence[Named]) -> Iterator[str]:
+def line_fault(line: str, document: Document, devices: Sequence[Named]) -> Iterator[Fault]:
     """Yields the fault of a line, or those of its devices, which `devices` has by name."""
     if not document["open"]:
         why = document["trouble"] or "not opened yet"
-        yield f"line {line} is down: {why}{_past(document, 'down_for', 'losses')}"
+        past = _past(document, "down_for", "losses")
+        yield Fault("line-down", f"line {line} is down: {why}{past}")
         return
     for name, one in devices:
         if is_another(one):
-            yield f"{name}: {one['diagnosis']}"
+            yield Fault("wrong-device", f"{name}: {one['diagnosis']}")
     silent = [(name, one) for name, one in devices if one["standing"] == "silent"]
     for alike in _alike(silent):
         name, first = alike[0]
         past = _past(first, "silent_for", "silences")
         if len(alike) == 1:
-            yield f"{name} is silent: {first['diagnosis']}{past}"
+            yield Fault("device-silent", f"{name} is silent: {first['diagnosis']}{past}")
         else:
             number = f"all {len(alike)}" if len(alike) == len(devices) else str(len(alike))
             of_all = "" if len(alike) == len(devices) else f" of {len(devices)}"
-            yield (
+            yield Fault(
+                "device-silent",
                 f"line {line}: {number}{of_all} devices are silent{_share(alike)}: "
-                f"{first['diagnosis']}{past}: {_names(alike)}"
+                f"{first['diagnosis']}{past}: {_names(alike)}",
             )
 
 

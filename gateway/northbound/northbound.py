@@ -17,6 +17,7 @@ from gateway.contract.interfaces import Device, Parts, Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import GroupResult
 from gateway.contract.problems import Failure
+from gateway.contract.report import report
 from gateway.errors import Busy, GatewayError
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.group.admission import Admission
@@ -358,7 +359,8 @@ class Northbound:
             for tag in [*device.tags][:1]
             if (word := tag.origin.not_real) is not None
         }
-        return {**documents, **own, **self._admission.documents(origins)}
+        found = {**documents, **own, **self._admission.documents(origins)}
+        return {**found, "report": report(found)}
 
 
 def check(config: Config) -> list[str]:

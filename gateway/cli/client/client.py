@@ -1,6 +1,7 @@
 """The client of a running gateway: reads, writes, follows."""
 
 import json
+import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
@@ -105,6 +106,17 @@ class Client:
         if "status" not in found:
             raise GatewayError(self.no_reply)
         return found
+
+    def reports(self) -> Iterator[tuple[str, bytes, float]]:
+        """Yields key, payload and arrival (s since 1970) of the report of each gateway under the
+        prefix. One that hangs delays the end by `REPLY_TIMEOUT`, and nothing else."""
+        for reply in self._session.get(
+            self._keys.reports,
+            timeout=REPLY_TIMEOUT,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        ):
+            if reply.ok is not None:
+                yield str(reply.ok.key_expr), reply.ok.payload.to_bytes(), time.time()
 
     def outcomes(self, since: str) -> list[dict[str, Any]] | None:
         """Returns the outcomes of writes since a time as in `_time`; None without history."""

@@ -1,7 +1,7 @@
 """The checked and complete configuration: plain data for the rest of the gateway."""
 
 from collections.abc import Container, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -72,6 +72,8 @@ class Config:
     transfers: tuple[TransferRule, ...] = ()
     watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
+    # Of the settings in the file; empty: they are in no file.
+    digest: str = field(default="", compare=False, repr=False)
 
     def part(self, kind: type[P]) -> P | None:
         """Returns the settings of a part; None: the file has not its section."""

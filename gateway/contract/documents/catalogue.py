@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gateway.contract.documents import requests, state, values
+from gateway.contract.documents import fleet, requests, state, values
 from gateway.tags import Reason
 
 FILE = Path(__file__).parent / "contract.json"
@@ -60,6 +60,7 @@ _STATE: dict[str, Any] = {  # by path
     "certificates/{setting}": state.CertificateDocument,
     "history": state.HistoryDocument,
     "reload": state.ReloadDocument,
+    "report": fleet.ReportDocument,
     "standby": state.StandbyDocument,
     "claim/{session}": state.ClaimDocument,
 }

@@ -213,17 +213,23 @@ class ClockDocument(TypedDict):
 
 
 class ReloadDocument(TypedDict):
-    """The configuration file."""
+    """The configuration file. `revision`: its last commit in git, with `+` if it was changed since.
+
+    `digest`: of all settings, without comments and layout; files of one digest do the same.
+    """
 
     file: str
     loaded: Time
+    digest: NotRequired[str]
+    revision: NotRequired[str | None]
     reloads: int
     refused: Time | None
     why: list[str]
 
 
 class HistoryDocument(TypedDict):
-    """The history file. `state` is `ok` or one sentence."""
+    """The history file. `state` is `ok` or one sentence. `room`: bytes that it may still grow;
+    `free`: bytes on its disk."""
 
     state: str
     aside: list[str]
@@ -239,6 +245,8 @@ class HistoryDocument(TypedDict):
     alarms_stored: int
     alarms_lost: int
     bytes: int
+    room: NotRequired[int]
+    free: NotRequired[int | None]
     oldest: Time | None
 
 

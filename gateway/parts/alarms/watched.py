@@ -90,7 +90,7 @@ def _why_silent(line: Line, now: float) -> str:
     name, devices = line.engine.name, line.engine.devices
     documents = [(device.name, device_document(device, (), now)) for device in devices]
     told = line_fault(name, {"open": True}, documents)
-    return "; ".join(sentence.removeprefix(f"line {name}: ") for sentence in told)
+    return "; ".join(one.text.removeprefix(f"line {name}: ") for one in told)
 
 
 def _device(line: Line, device: Device, now: Callable[[], float]) -> Reading:

@@ -103,6 +103,8 @@ class Historian:
             "alarms_stored": self._alarms.stored,
             "alarms_lost": self._alarms.lost,
             "bytes": self._retention.size,
+            "room": self._retention.room,
+            "free": self._retention.free,
             "oldest": None if oldest is None else rfc3339(oldest),
         }
 

@@ -2,6 +2,8 @@
 
 import asyncio
 import hashlib
+import shutil
+import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +23,7 @@ log = structlog.get_logger("gateway")
 _EFFECT = "the gateway goes on with the file as it was"
 _MOST_LOGGED = 20  # mistakes
 READ_WITHIN = 120.0  # seconds: a network file system may hang
+_GIT_WITHIN = 5.0  # seconds
 
 
 class Reloader:
@@ -35,6 +38,8 @@ class Reloader:
         self._loaded = wall()
         self._count = 0
         self._refused: tuple[int, Sequence[str]] | None = None
+        self._revision: str | None = None  # in git, of the file that was taken over
+        self._read_revision: str | None = None  # of the file that was read last
 
     def want(self) -> None:
         """Reads the file again as soon as the reload before has ended."""
@@ -42,7 +47,8 @@ class Reloader:
 
     async def watch(self) -> None:
         """Runs until cancelled: wants a reload after each change, if the file says so."""
-        await off_loop(self._watch.note, self._files())
+        await off_loop(self._note)
+        self._revision = self._read_revision
         while True:
             await asyncio.sleep(LOOK_EVERY)
             if self.current.watch:
@@ -76,7 +82,7 @@ class Reloader:
     def accept(self, config: Config, difference: Difference | None = None) -> None:
         """Notes that the gateway has taken over the file."""
         self.current, self._refused = config, None
-        self._loaded = self._wall()
+        self._loaded, self._revision = self._wall(), self._read_revision
         self._count += 1
         changes = () if difference is None else difference.devices.values()
         log.info(
@@ -100,23 +106,56 @@ class Reloader:
         return {
             "file": str(self._path),
             "loaded": rfc3339(self._loaded),
+            "digest": self.current.digest,
+            "revision": self._revision,
             "reloads": self._count,
             "refused": None if at is None else rfc3339(at),
             "why": [*why[:_MOST_LOGGED]],
         }
+
+    def _note(self) -> None:
+        """Notes the files before they are read. Blocks."""
+        self._watch.note(self._files())
+        self._read_revision = _revision(self._path)
 
     def _files(self) -> list[Path]:
         return list(dict.fromkeys([self._path, *(sheet.file for sheet in self.current.sheets)]))
 
     def _read(self) -> Config | list[str]:
         """Returns the content of the file, or what is wrong with it."""
-        self._watch.note(self._files())
+        self._note()
         try:
             config = load(self._path)
         except ConfigErrors as error:
             return str(error).splitlines()
         changed = needs_restart(self.current, config)
         return [f"{self._path}: {one} changed: this needs a restart" for one in changed] or config
+
+
+def _revision(file: Path) -> str | None:
+    """Returns the last commit of a file in git, with `+` if the file was changed since; None: it is
+    in no repository, or here is no git. Blocks."""
+    git = shutil.which("git")
+    if git is None:
+        return None
+    ask = [git, "-C", str(file.parent), "-c", "core.fsmonitor=false"]
+    try:
+        commit, changed = (
+            subprocess.run(  # noqa: S603  (git, with the name of the file)
+                [*ask, *what, "--", file.name],
+                capture_output=True,
+                text=True,
+                timeout=_GIT_WITHIN,
+                check=True,
+            ).stdout.strip()
+            for what in (
+                ("log", "-1", "--format=%h", "--abbrev=12"),
+                ("diff", "--name-only", "HEAD"),
+            )
+        )
+    except (subprocess.SubprocessError, OSError):
+        return None
+    return f"{commit}{'+' if changed else ''}" if commit else None
 
 
 STILL = 1.0  # seconds

@@ -3,6 +3,7 @@
 Both on the history thread: the size of the file and the age of its samples have limits.
 """
 
+import shutil
 import sqlite3
 import time
 from collections.abc import Callable, Sequence
@@ -36,6 +37,7 @@ class Retention:
     def __init__(self, keep: float, max_size: int, recent: Recent, wall: Callable[[], int]) -> None:
         """`keep`: seconds; `max_size`: bytes; `wall`: ns since 1970."""
         self.size = 0  # bytes, as last measured
+        self.free: int | None = None  # bytes of its disk, as last measured
         self._keep = int(keep * 1e9)
         self._max_size = max_size
         self._recent = recent
@@ -47,6 +49,11 @@ class Retention:
         """Outcomes of writes that the file keeps."""
         most = self._max_size // 10 // _ROOM_OF_OUTCOME
         return max(100, most // 10 if ring is Ring.REFUSED else most)
+
+    @property
+    def room(self) -> int:
+        """Bytes that the file may still grow."""
+        return max(0, self._max_size - self.size)
 
     def run_was_sorted(self) -> None:
         """Checks the age of the runs at the next call of `make_room`."""
@@ -63,6 +70,7 @@ class Retention:
             self._next_check = now + min(10.0, self._keep / 1e9 / 20)
             self._may_expire = _MOST_EXPIRED
             file.shrink()
+            self.free = shutil.disk_usage(file.path.parent).free
         self.size = file.size()
         if self.size > self._max_size:
             file.shrink()
