@@ -21,6 +21,11 @@ TINY = [
     ),
     ("commands", "--calls 1", [r"^\| `check` \| \d+ \|$", r"^\| `run` \| \d+ \|$"]),
     ("encodings", "", [r"^\| a value \| 68 \| 57 \(84%\) \|"]),
+    (
+        "fleet",
+        "--gateways 4 --processes 2",
+        [r"^4 of 4 gateways in [\d.]+ s", r"^files that differ: 1 named, 0 ", r"killed: 2 missing"],
+    ),
     ("frames_noise", "0.07", [r"^gap +CR +[\d.]+ +[\d.]+ +[\d.]+$"]),
     (
         "history",
