@@ -31,7 +31,7 @@ _UNSET = termios.B50
 RATES = {
     getattr(termios, name): int(name[1:])
     for name in dir(termios)
-    if name[0] == "B" and name[1:].isdigit()
+    if name[0] == "B" and name[1:].isdigit() and name != "B0"  # which hangs up
 }
 # With EXTPROC (Linux) the kernel echoes nothing, whatever a program sets: the echo of a reply would
 # be taken for its next request.

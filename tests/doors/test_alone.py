@@ -17,6 +17,7 @@ from gateway.parts.doors.open_door import OpenDoor
 from gateway.parts.doors.settings import Sharing
 from gateway.plant.plant import Plant
 from gateway.transport import rfc2217
+from gateway.transport.telnet import Setting, Telnet
 from tests.transport.ends import PATIENCE, PtyMaster, free_port
 from tests.transport.test_rfc2217 import FakeSerial, Managed, serving
 
@@ -109,17 +110,23 @@ async def test_speed_and_format_of_a_tool_reach_the_port_and_are_put_back() -> N
         master.write(EVERY_BYTE)
         assert await asyncio.to_thread(client.read, len(EVERY_BYTE)) == EVERY_BYTE
 
+        asked = Telnet.request(Setting.BAUDRATE, 0)  # the present one: it hung up
+        await asyncio.to_thread(client._internal_raw_write, asked)  # it has no method for it
+
         def change() -> None:
             client.baudrate = 4800
             client.dtr = False
 
+        await asyncio.to_thread(client.write, b"!")
+        await ends_with(master, b"!")
+        assert master.format()[1] == termios.B38400
         await asyncio.to_thread(change)
         assert master.format()[1] == termios.B4800
         await asyncio.to_thread(client.close)
         await found.until(lambda: found.open)
         flags, speed = master.format()
         assert (speed, flags & termios.CSTOPB) == (termios.B9600, 0)
-        assert f"it had the wire, and sent {len(EVERY_BYTE)} bytes" in found.told[0]
+        assert f"it had the wire, and sent {len(EVERY_BYTE) + 1} bytes" in found.told[0]
     master.unplug()
 
 

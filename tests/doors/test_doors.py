@@ -15,6 +15,7 @@ from gateway.config import built
 from gateway.config.messages import ConfigErrors
 from gateway.contract.keys import Keys
 from gateway.errors import Refused
+from gateway.line.send_permit import SendPermit
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.doors.guest import MOST_WAITING, Guest
@@ -119,6 +120,7 @@ class Hall:
     door: OpenDoor
     outcomes: list[bytes]
     second: OpenDoor | None = None
+    held: dict[str, float] = field(default_factory=dict)  # "until": the process stood still
 
 
 @asynccontextmanager
@@ -126,7 +128,9 @@ async def opened(
     settings: dict[str, Any], lines: Any = LINES, **second: dict[str, Any]
 ) -> AsyncIterator[Hall]:
     config = built({"lines": lines, "share": {"doors": {"laptop": settings, **second}}})
-    plant = Plant(config, lambda: int(now() * 1e9))
+    held: dict[str, float] = {"until": -1e9}
+    duty = SendPermit(lambda: held["until"])
+    plant = Plant(config, lambda: int(now() * 1e9), duty=duty)
     outcomes: list[bytes] = []
     own = OwnWrites(Keys("plant", "demo"), plant, Audit(outcomes.append))
 
@@ -149,7 +153,7 @@ async def opened(
             for line in plant.lines:
                 tasks.create_task(line.run())
             await asyncio.sleep(2)
-            yield Hall(plant, made[0], outcomes, made[-1])
+            yield Hall(plant, made[0], outcomes, made[-1], held)
             _end()
     except* _End:
         pass
@@ -412,6 +416,18 @@ async def test_the_program_of_another_door_does_not_take_the_wire_from_the_first
         first.guest.lost(OSError("gone"))
         await asyncio.sleep(15)
         assert quality(hall) == ("good", None)
+
+
+@on_virtual_time
+async def test_what_a_program_sent_while_the_process_was_held_does_not_reach_the_wire() -> None:
+    """Another gateway of the group had the wire meanwhile."""
+    async with opened(door("hall", "raw")) as hall:
+        program = Program(hall.door)
+        assert await program.ask(rtu("06 000a 0001")) == rtu("06 000a 0001")
+        hall.held["until"] = now()
+        assert await program.ask(rtu("06 000a 0002"), wait=15.0) == b""
+        assert program.closed
+        assert await Program(hall.door).ask(rtu("03 000a 0001")) == rtu("03 02 0001")
 
 
 @on_virtual_time

@@ -63,6 +63,9 @@ class Tunnel:
         self._work = self._door.start(self._serve())
 
     def received(self, data: bytes) -> None:
+        if why := self._door.why_not(asyncio.get_running_loop().time()):
+            self.leave(why)
+            return
         self._follow()
         self._say(self._speech.begin())
         for item in self._speech.hear(data):
@@ -135,6 +138,8 @@ class Tunnel:
             item = self._items.popleft()
             if isinstance(item, bytes):
                 self._waiting -= len(item)
+                if why := self._door.why_not(asyncio.get_running_loop().time()):
+                    raise LineDown(why)
                 self._set_up.sent(len(item))
                 self._pass(item, self._wire)
             elif isinstance(item, Change):
