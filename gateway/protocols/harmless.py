@@ -4,8 +4,9 @@ A device may be silent about addresses that it lacks. So a resync reads inside t
 caller names, and each resync in another place and with another form of its reply.
 """
 
-from collections.abc import Awaitable, Callable, Collection, Hashable, Sequence
+from collections.abc import Awaitable, Callable, Hashable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from gateway.errors import Refused
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span
@@ -72,7 +73,7 @@ class HarmlessReads:
 
     def __post_init__(self) -> None:
         late = None if self.outstanding is None else self.form(self.outstanding)
-        places = (self._place(span, late) for span in self.spans)
+        places = (_place(self.form, span, late) for span in self.spans)
         self._places = [place for place in places if place[0]]
 
     def __bool__(self) -> bool:
@@ -92,33 +93,44 @@ class HarmlessReads:
         reads = first[turn % 2]
         return reads[(2 * step + second) % len(reads)]
 
-    def proof(self, used: Collection[Hashable] = ()) -> Span | None:
+    def proof(self, used: tuple[Hashable, ...] = ()) -> Span | None:
         """Returns a read whose form no other resync has, nor those `used`; None: there is none."""
-        forms = {self.form(read) for place in self._places for reads in place for read in reads}
-        forms.update(used, () if self.outstanding is None else (self.form(self.outstanding),))
-        for area, start, size in self.spans:
-            found: set[Hashable] = set()
-            for units in range(1, min(size, MOST_UNITS) + 1):
-                read = Span(area, start, units)
-                found.add(form := self.form(read))
-                if len(found) >= PROOF_FORM and form is not None and form not in forms:
-                    return read
-        return None
+        return _proof(self.form, tuple(self.spans), self.outstanding, used)
 
-    def _place(self, span: Span, late: Hashable) -> tuple[Sequence[Span], Sequence[Span]]:
-        """Returns the reads at the begin of the span, and those at its end."""
-        area, start, size = span
-        begin: dict[Hashable, Span] = {}
-        end: dict[Hashable, Span] = {}
+
+# Each time-out of a device asks for the same reads again.
+@lru_cache(4096)
+def _place(form: FormOf, span: Span, late: Hashable) -> tuple[Sequence[Span], Sequence[Span]]:
+    """Returns the reads at the begin of the span, and those at its end."""
+    area, start, size = span
+    begin: dict[Hashable, Span] = {}
+    end: dict[Hashable, Span] = {}
+    for units in range(1, min(size, MOST_UNITS) + 1):
+        for found, at in ((begin, start), (end, start + size - units)):
+            read = Span(area, at, units)
+            shape = form(read)
+            if shape is not None and shape != late:
+                found.setdefault(shape, read)
+        if len(begin) == MOST_FORMS:
+            break
+    return list(begin.values()), list((end or begin).values())
+
+
+@lru_cache(1024)
+def _proof(
+    form: FormOf, spans: tuple[Span, ...], outstanding: Span | None, used: tuple[Hashable, ...]
+) -> Span | None:
+    late = None if outstanding is None else form(outstanding)
+    forms = {form(read) for span in spans for reads in _place(form, span, late) for read in reads}
+    forms.update(used, () if outstanding is None else (late,))
+    for area, start, size in spans:
+        found: set[Hashable] = set()
         for units in range(1, min(size, MOST_UNITS) + 1):
-            for found, at in ((begin, start), (end, start + size - units)):
-                read = Span(area, at, units)
-                shape = self.form(read)
-                if shape is not None and shape != late:
-                    found.setdefault(shape, read)
-            if len(begin) == MOST_FORMS:
-                break
-        return list(begin.values()), list((end or begin).values())
+            read = Span(area, start, units)
+            found.add(own := form(read))
+            if len(found) >= PROOF_FORM and own is not None and own not in forms:
+                return read
+    return None
 
 
 _ODD_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # bytes: no read of words has these

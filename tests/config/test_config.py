@@ -6,6 +6,7 @@ import tempfile
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config import Config, ConfigErrors, load, schema
+from gateway.config import Config, ConfigErrors, load
+from gateway.config import schema as made_schema
 from gateway.config.settings import parsers
 from gateway.config.settings.session_model import Section, ZenohSection
 from gateway.config.tags.section import TagDefaults
@@ -32,6 +34,7 @@ from gateway.values import Kind, Order, ValueType
 from tests.schema_check import violations
 
 EXAMPLE = Path(__file__).parents[2] / "config.example.yaml"
+schema = cache(made_schema)  # it takes a quarter of a second
 
 CONTRACT = """\
 gateway: {name: demo}

@@ -92,7 +92,7 @@ class LineSilence(Rule):
 
     def received(self, data: bytes, now: float, time: int) -> None:
         """Takes bytes of a device that sends unsolicited frames."""
-        if any(speaks(device) for device in self._devices):
+        if self._noted and any(speaks(device) for device in self._devices):
             self._heard()
 
     def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:

@@ -54,6 +54,7 @@ class RtuCodec:
         self._sent = b""
         self._size = 0  # of the whole reply, unless it is an exception
         self._damage: Garbled | None = None
+        self._noise = 0  # bytes at the begin of `_heard` where no reply can begin
 
     def encode(self, frame: Frame) -> bytes:
         self._sent = encode(frame)
@@ -78,14 +79,18 @@ class RtuCodec:
 
     def _take(self) -> Frame | None:
         heard = self._heard
-        del heard[:-_KEPT]
-        for start in range(len(heard) - _SHORTEST + 1):
+        if (much := len(heard) - _KEPT) > 0:
+            del heard[:much]
+            self._noise = max(0, self._noise - much)
+        for start in range(self._noise, len(heard) - _SHORTEST + 1):
             size = _reply_size(heard, start)
             if size == 0:
+                self._noise += start == self._noise
                 continue
             whole = bytes(heard[start : start + size])
             if len(whole) == size and is_sound(whole):
                 del heard[: start + size]
+                self._noise = 0
                 return Frame(whole[0], whole[1:-2])
             if whole[:2] != self._sent[:2] or self._may_be_echo(heard[start:]):
                 continue
@@ -171,6 +176,7 @@ class RtuSlaveCodec:
                 return None
             if len(whole) == size and is_sound(whole):
                 del heard[: start + size]
+                self._noise = 0
                 return Frame(whole[0], whole[1:-2])
         return self._unknown()
 
