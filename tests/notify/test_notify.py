@@ -9,6 +9,9 @@ import pytest
 
 from gateway.config import load
 from gateway.errors import ConfigError
+from gateway.parts.notify.message import Message, message
+from gateway.parts.notify.outbox import Outbox
+from gateway.parts.notify.watch import TEST
 from tests.e2e.processes import free_port, plc_gateway, started, until, write_config
 from tests.notify.test_ways import Mailbox, mail_server
 from tests.zenoh_peer import free_endpoint
@@ -90,3 +93,16 @@ def test_a_mistake_is_named(tmp_path: Path, notify: dict[str, Any], why: str) ->
         load(config)
     assert why in str(raised.value)
     assert "notify" in str(raised.value)
+
+
+def test_a_message_is_as_old_as_the_gateway_ran() -> None:
+    """A wall clock that was ten years ahead for a moment dropped the alarms that waited."""
+    box, after = Outbox(keep=60.0), Outbox(keep=60.0)
+    old = message("plant", "demo", [TEST], 0)  # the year 1970
+    box.put(old, 100.0)
+    assert box.first(159.0) is old
+    saved = box.saved(159.0)
+    after.restore([(Message.restored(one), one["waited"]) for one in saved], 10.0)
+    assert after.first(10.5) == old
+    assert after.first(11.5) is None
+    assert after.document()["dropped"] == 1

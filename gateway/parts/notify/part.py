@@ -58,7 +58,7 @@ class NotifyPart:
             for key, (raised, at, ended) in told.get(watch.rule.key, {}).items():
                 watch.told[key] = Told(raised, now - max(0, wall - at) / 1e9, ended)
         for way, box in self._boxes.items():
-            box.restore(waiting.get(way, ()))
+            box.restore(waiting.get(way, ()), now)
 
     async def run(self) -> None:
         self._file.start()
@@ -105,14 +105,14 @@ class NotifyPart:
             if notices := watch.look(self._alarms, listed.one, now, clock):
                 new = message(config.zenoh.prefix, config.name, notices, wall)
                 for way in watch.rule.to:
-                    self._boxes[way].put(new)
+                    self._boxes[way].put(new, now)
                     self._filled[way].set()
                 self._unsaved = True
 
     async def _send_all(self, way: str) -> None:
-        box, again = self._boxes[way], AGAIN_FIRST
+        box, again, loop = self._boxes[way], AGAIN_FIRST, asyncio.get_running_loop()
         while True:
-            waiting = box.first(self._core.plant.wall())
+            waiting = box.first(loop.time())
             if waiting is None:
                 self._filled[way].clear()
                 await self._filled[way].wait()
@@ -140,11 +140,11 @@ class NotifyPart:
             }
             for watch in self._watches
         }
-        waiting = {way: box.saved() for way, box in self._boxes.items()}
+        waiting = {way: box.saved(now) for way, box in self._boxes.items()}
         return orjson.dumps({"form": FORMAT, "told": told, "waiting": waiting})
 
 
-def _parse(document: Any) -> tuple[_ToldByRule, dict[str, list[Message]]]:
+def _parse(document: Any) -> tuple[_ToldByRule, dict[str, list[tuple[Message, float]]]]:
     """Raises ValueError, TypeError, KeyError, AttributeError for a damaged file."""
     if document["form"] != FORMAT:
         raise ValueError(f"form {document['form']} is not {FORMAT}")
@@ -155,7 +155,10 @@ def _parse(document: Any) -> tuple[_ToldByRule, dict[str, list[Message]]]:
         for rule, known in document["told"].items()
     }
     waiting = document["waiting"].items()
-    return told, {way: [Message.restored(one) for one in found] for way, found in waiting}
+    return told, {
+        way: [(Message.restored(one), max(0.0, float(one.get("waited", 0)))) for one in found]
+        for way, found in waiting
+    }
 
 
 def _make(core: Core) -> Part | None:
