@@ -2,6 +2,7 @@
 
 import sys
 import time
+from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
@@ -19,6 +20,17 @@ def utc_now() -> str:
 
 def bad(reason: str) -> Known:
     return {"value": None, "quality": "bad", "reason": reason, "time": utc_now()}
+
+
+def described_by(key: str, payload: bytes) -> Known | None:
+    """Returns the description of a tag, None for that of another program."""
+    with suppress(ValueError):
+        meta = orjson.loads(payload)
+        if isinstance(meta, dict) and isinstance(meta.get("type"), str) and "+" not in key:
+            plain = {"unit": "", "description": "", "history": False, "write": None}
+            found: Known = plain | meta
+            return found
+    return None
 
 
 def parsed(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known:

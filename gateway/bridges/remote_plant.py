@@ -12,7 +12,7 @@ from contextlib import suppress
 import orjson
 import zenoh
 
-from gateway.bridges.documents import Known, bad, copied, parsed
+from gateway.bridges.documents import Known, bad, copied, described_by, parsed
 from gateway.bridges.presence import Presence
 from gateway.bridges.program import say
 from gateway.bridges.requests import Inbox, Requests
@@ -53,6 +53,11 @@ class RemotePlant:
             live.declare_subscriber(own, token, history=True),
             live.declare_subscriber(f"{own}/alive/*", token, history=True),
         ]
+
+    @property
+    def trusted(self) -> set[str]:
+        """The devices that answer, and are described."""
+        return self._presence.trusted
 
     def key(self, key: str) -> str:
         return key.removeprefix(f"{self._prefix}/")
@@ -134,21 +139,27 @@ class RemotePlant:
                 await asyncio.wait_for(self._query_due.wait(), pause)
                 pause = RETRY_AFTER
 
-    async def _query(self) -> bool:
-        """Returns True if every tag of every device with a token was answered."""
+    async def _describe(self) -> None:
+        """Queries the descriptions. A device that answered before is trusted then."""
         self._presence.asked()
         described = set()
         for reply in await self.requests.ask("**/@meta"):
-            if (sample := reply.ok) is not None:
-                key = self.key(str(sample.key_expr)).removesuffix("/@meta")
-                meta = orjson.loads(sample.payload.to_bytes())
-                described.add(key.partition("/")[0])
-                if self.tags.get(key) != meta:
-                    self.tags[key] = meta
-                    self._described(key, meta)
-                    if key not in self.values:
-                        self._store(key, bad("starting"))
+            if (sample := reply.ok) is None:
+                continue
+            key = self.key(str(sample.key_expr)).removesuffix("/@meta")
+            if (meta := described_by(key, sample.payload.to_bytes())) is None:
+                continue
+            described.add(key.partition("/")[0])
+            if self.tags.get(key) != meta:
+                self.tags[key] = meta
+                self._described(key, meta)
+                if key not in self.values:
+                    self._store(key, bad("starting"))
         self._presence.described(described)
+
+    async def _query(self) -> bool:
+        """Returns True if every tag of every device with a token was answered."""
+        await self._describe()
         self._live.clear()
         replies = [reply.ok for reply in await self.requests.ask("**")]
         answered = {self.key(str(sample.key_expr)) for sample in replies if sample is not None}

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from gateway.bridges.program import Gateways, extra, run
+from gateway.errors import ConfigError
 
 cli = typer.Typer(help="Values to another system, and writes back.", no_args_is_help=True)
 
@@ -46,9 +47,9 @@ def mqtt(
     connect: Connect = [_TCP],  # noqa: B006
     zenoh: ZenohFile = None,
     prefix: Prefix = "plant",
-    broker: Annotated[str, typer.Option(help="mqtt://host:port or mqtts://user@host.")] = (
-        "mqtt://127.0.0.1:1883"
-    ),
+    broker: Annotated[
+        list[str], typer.Option(help="mqtt://host:port or mqtts://user@host; several: spare.")
+    ] = ["mqtt://127.0.0.1:1883"],  # noqa: B006
     root: Annotated[
         str | None, typer.Option(help="The first levels of all topics (default: the prefix).")
     ] = None,
@@ -59,12 +60,29 @@ def mqtt(
     commands: Annotated[Path, typer.Option(help="The file with the ids of commands.")] = (
         Path("mqtt-commands.db")
     ),
+    sparkplug: Annotated[
+        str | None, typer.Option(metavar="GROUP", help="Sparkplug B in this group, not JSON.")
+    ] = None,
+    node: Annotated[
+        str | None, typer.Option(help="The edge node of Sparkplug (default: the prefix).")
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option(help="The primary host of Sparkplug: born only while it is there.")
+    ] = None,
 ) -> None:
     """Publish the values to an MQTT broker, and take commands from it."""
-    with extra("mqtt"):
-        from gateway.bridges.mqtt.bridge import bridge
     gateways = Gateways(connect, zenoh, prefix)
-    run(bridge(gateways, broker, root, expire, commands if writes else None))
+    if sparkplug is None:
+        if node or host:
+            raise ConfigError("--node and --host belong to --sparkplug")
+        with extra("mqtt"):
+            from gateway.bridges.mqtt.bridge import bridge
+        run(bridge(gateways, broker, root, expire, commands if writes else None))
+    else:
+        with extra("mqtt"):
+            from gateway.bridges.mqtt.sparkplug.bridge import bridge as sparkplug_bridge
+        ids = sparkplug, node or prefix.replace("/", "-")
+        run(sparkplug_bridge(gateways, broker, ids, host, writes))
 
 
 @cli.command()

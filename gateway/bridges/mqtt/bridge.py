@@ -29,13 +29,12 @@ import json
 import math
 import os
 import sqlite3
-import ssl
 import time
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from urllib.parse import urlsplit
 from weakref import WeakValueDictionary
 
 import aiomqtt
@@ -44,11 +43,11 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from gateway.bridges.documents import Known, bad
+from gateway.bridges.mqtt.broker import checked, client, sessions
 from gateway.bridges.mqtt.commands import Commands, parsed
 from gateway.bridges.program import Gateways, opened, say
 from gateway.bridges.remote_plant import RemotePlant
 
-RECONNECT_AFTER = 1.0  # seconds
 BATCH = 100  # messages on their way to the broker
 LATE = 1.0  # seconds: longer than that no change waits while the bridge is `online`
 MOST_COMMANDS = 100  # that wait; the next one is dropped, without an outcome
@@ -89,32 +88,13 @@ class Bridge:
         self._pending.setdefault(topic, time.monotonic())
         self._news.set()
 
-    async def serve(self, address: str) -> None:
-        """Connects to the broker again and again."""
-        where = urlsplit(address)
-        secure = where.scheme == "mqtts"
-        while True:
-            client = aiomqtt.Client(
-                where.hostname or "127.0.0.1",
-                where.port or (8883 if secure else 1883),
-                username=where.username,
-                password=os.environ.get("MQTT_PASSWORD"),
-                tls_context=ssl.create_default_context() if secure else None,
-                # The same name again: the broker ends an old connection, with its last will, first.
-                identifier=f"gateway-{self._root.replace('/', '-')}",
-                protocol=aiomqtt.ProtocolVersion.V5,
-                clean_start=True,  # no command waits at the broker
-                keepalive=10,
-                will=aiomqtt.Will(f"{self._root}/@bridge", "offline", qos=1, retain=True),
-            )
-            try:
-                async with client as broker:
-                    await self._session(broker)
-            except* aiomqtt.MqttError as errors:
-                say(f"broker: {errors.exceptions[0]}")
-            await asyncio.sleep(RECONNECT_AFTER)
+    def client(self, address: str) -> aiomqtt.Client:
+        will = aiomqtt.Will(f"{self._root}/@bridge", "offline", qos=1, retain=True)
+        return client(
+            address, f"gateway-{self._root.replace('/', '-')}", will, aiomqtt.ProtocolVersion.V5
+        )
 
-    async def _session(self, broker: aiomqtt.Client) -> None:
+    async def session(self, broker: aiomqtt.Client) -> None:
         """Publishes everything, then every change; `online` comes after the first values."""
         self._is_online = False
         broker.pending_calls_threshold = 2 * BATCH
@@ -138,9 +118,11 @@ class Bridge:
                         await self._retain(broker, topic, json.dumps(bad("no-bridge")).encode())
 
     async def _tell(self, broker: aiomqtt.Client, online: bool) -> None:
+        """Says it for as long as values are kept: a broker may end together with this bridge, and
+        begin again with what it had."""
         self._is_online = online
-        state = "online" if online else "offline"
-        await broker.publish(f"{self._root}/@bridge", state, qos=1, retain=True)
+        state = b"online" if online else b"offline"
+        await self._retain(broker, f"{self._root}/@bridge", state, qos=1)
 
     async def _clear(self, broker: aiomqtt.Client) -> None:
         """Replaces what an earlier run left at the broker and this one does not have."""
@@ -158,11 +140,13 @@ class Bridge:
         while len(broker.messages):  # own ones
             await anext(broker.messages)
 
-    async def _retain(self, broker: aiomqtt.Client, topic: str, payload: bytes = b"") -> None:
+    async def _retain(
+        self, broker: aiomqtt.Client, topic: str, payload: bytes = b"", qos: int = 0
+    ) -> None:
         expiring = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         expiring.MessageExpiryInterval = self._expire
         payload = payload or self._retained.get(topic, b"")
-        await broker.publish(topic, payload, retain=True, properties=expiring)
+        await broker.publish(topic, payload, qos, retain=True, properties=expiring)
 
     async def _publish(self, broker: aiomqtt.Client) -> None:
         """Publishes all that waits. The bridge is `offline` while a change waits for long."""
@@ -190,6 +174,7 @@ class Bridge:
                 self._news.clear()
                 await self._publish(broker)
             self._repeats = dict.fromkeys(self._retained, 0.0)
+            await self._tell(broker, self._is_online)
 
     async def _receive(self, broker: aiomqtt.Client, commands: Commands) -> None:
         async for message in broker.messages:
@@ -232,12 +217,13 @@ class Bridge:
 
 
 async def bridge(
-    gateways: Gateways, broker: str, root: str | None, expire: int, commands: Path | None
+    gateways: Gateways, brokers: Sequence[str], root: str | None, expire: int, commands: Path | None
 ) -> None:
     """Serves until it is cancelled. `commands`: the file with the ids of commands, or no writes."""
+    checked(brokers)
     with await opened(gateways) as session:
         served = Bridge(root or gateways.prefix, expire, commands)
         served.plant = RemotePlant(session, gateways.prefix, served.described, served.changed)
         async with asyncio.TaskGroup() as group:
             group.create_task(served.plant.follow())
-            group.create_task(served.serve(broker))
+            group.create_task(sessions(brokers, served.client, served.session))
