@@ -12,7 +12,7 @@ from tests.conftest import needs
 from tests.e2e.processes import ROOT
 
 PACKAGING = ROOT / "packaging"
-UNIT = PACKAGING / "systemd/plc-gateway@.service"
+UNITS = ("plc-gateway@", "plc-gateway-bridge@")
 DOCKERFILE = ROOT / "Dockerfile"
 WORST = 30  # tenths, of `systemd-analyze security`
 
@@ -22,12 +22,13 @@ def analyze(*arguments: object) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    """The unit of a gateway `hall`, with a program that is installed here."""
-    text, count = re.subn(r"(?<=ExecStart=)/opt/\S+", "/bin/true", UNIT.read_text())
+@pytest.fixture(params=UNITS)
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """The unit of a gateway or bridge `hall`, with a program that is installed here."""
+    own = (PACKAGING / f"systemd/{request.param}.service").read_text()
+    text, count = re.subn(r"(?<=ExecStart=)/opt/\S+", "/bin/true", own)
     assert count == 1
-    file = tmp_path / "plc-gateway@hall.service"
+    file = tmp_path / f"{request.param}hall.service"
     file.write_text(text)
     return file
 

@@ -95,8 +95,11 @@ def influx(
     ] = None,
     every: Annotated[float, typer.Option(help="Seconds between two requests.")] = 1.0,
     queue: Annotated[int, typer.Option(help="Lines that may wait.")] = 500_000,
+    state: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Recover what a restart has missed.")
+    ] = None,
 ) -> None:
     """Send the values to InfluxDB, Telegraf, and what else takes their line protocol."""
     from gateway.bridges.influx.bridge import bridge
 
-    run(bridge(Gateways(connect, zenoh, prefix), to, every, queue))
+    run(bridge(Gateways(connect, zenoh, prefix), to, every, queue, state))

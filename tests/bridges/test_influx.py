@@ -4,6 +4,7 @@ import json
 import signal
 import sys
 import threading
+import time
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
@@ -14,9 +15,23 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from gateway.bridges.influx.gaps import Gaps
+from gateway.bridges.influx.lines import line_of
+from gateway.errors import ConfigError
 from tests.bridges.conftest import bridge
-from tests.bridges.played import PlayedGateway
-from tests.e2e.processes import ROOT, Program, free_port, listens, until
+from tests.bridges.played import PlayedGateway, document
+from tests.e2e.processes import (
+    ROOT,
+    Program,
+    free_port,
+    listens,
+    started,
+    until,
+    vigor_line,
+    write_config,
+)
 from tests.zenoh_peer import free_endpoint
 
 TAGS: dict[str, dict[str, Any]] = {
@@ -154,4 +169,59 @@ def test_lost_and_refused_lines_are_counted_and_reported(tmp_path: Path) -> None
             assert [line.split(" ")[1] for line in lines] == [
                 f"value={value}.0,good=true" for value in (3, 4, 5)
             ]
-            assert note.startswith("plc_bridge lost=2i,refused=1i ")
+            assert note.startswith("plc_bridge lost=2i,refused=1i,recovered=0i ")
+
+
+def test_what_a_killed_bridge_has_missed_comes_from_the_history(tmp_path: Path) -> None:
+    endpoint, bodies, state = free_endpoint(), list[str](), tmp_path / "state.json"
+    tags = {"speed": {"address": "D100", "every": "50ms", "history": True}}
+    lines = {"hall": vigor_line("simulator", tags)}
+    file = write_config(tmp_path / "c.yaml", endpoint, lines, history={"path": "history.db"})
+
+    def times() -> list[int]:
+        text = "".join(bodies).splitlines()
+        return sorted({int(line.split()[-1]) for line in text if "name=speed" in line})
+
+    with started(file), failing_server([204], bodies) as to:
+        options = ("--connect", endpoint, "--to", to, "--every", 0.1, "--state", state)
+        with bridge("influx", *options) as first:
+            until(state.exists, "the state is kept")
+            first.end(signal.SIGKILL)
+        before = times()[-1]
+        until(lambda: time.time_ns() > before + 10**9, "samples are missed")
+        with bridge("influx", *options) as second:
+            second.says("samples of mixer since", "recovered")
+            assert len([at for at in times() if before < at < before + 10**9]) > 3
+            assert second.end() == 0
+
+
+async def test_a_gap_is_kept_until_it_is_filled(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    gaps = Gaps(path)
+    gaps.heard("a", answers=True)
+    assert gaps.take("a") is None  # nothing was sent before
+    gaps.sent("a", "T5")
+    gaps.sent("a", "T3")
+    await gaps.save()
+    again = Gaps(path)
+    again.heard("a", answers=True)
+    again.sent("a", "T6")
+    again.heard("a", answers=True)
+    again.open("a", "T7")
+    assert (again.take("b"), again.take("a")) == (None, "T5")
+    again.sent("a", "T9")
+    await again.save()
+    assert json.loads(path.read_text()) == {"a": "T5"}  # the server does not have them yet
+    again.filled("a")
+    again.heard("a", answers=False)
+    assert again.take("a") is None
+    again.heard("a", answers=True)
+    assert again.take("a") == "T9"
+    path.write_text("[1]")
+    with pytest.raises(ConfigError, match="state file"):
+        Gaps(path)
+
+
+def test_a_name_of_another_program_cannot_forge_a_field() -> None:
+    line = line_of("a b/c,good=true x", document(7))
+    assert line.startswith("plc,device=a\\ b,name=c\\,good\\=true\\ x value=7.0,good=true ")

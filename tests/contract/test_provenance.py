@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gateway.bridges.documents import is_value
-from gateway.bridges.influx.bridge import line_of
+from gateway.bridges.influx.lines import line_of
 from gateway.bridges.mqtt.bridge import Bridge
 from gateway.bridges.opcua.values import Code, data_value, type_of
 from gateway.cli.history.history import _SAMPLES, _row  # a line of a CSV file, without the file

@@ -1,27 +1,14 @@
-"""InfluxDB line protocol: values of the gateway to InfluxDB, Telegraf, or the standard output.
+"""InfluxDB line protocol: values of the gateways to InfluxDB, Telegraf, or the standard output.
 
-`--to` is the address of a write API: InfluxDB 1 (`/write?db=plant`), 2 and 3 (with the token in
-`INFLUX_TOKEN`), VictoriaMetrics, or Telegraf's `inputs.influxdb_v2_listener`. Without it the lines
-go to the standard output, for Telegraf's `inputs.execd`.
+The time of a line is that of the sample. A value that becomes good again without a new sample has
+the time of its return. While the server does not answer, lines wait in a queue, and are sent again
+with the same time: a second copy replaces the first. Beyond the queue the oldest are lost. Lines
+that the server refuses (status 400, 413 and 422) are dropped. Both are counted in `plc_bridge`.
 
-    plc,device=mixer,name=speed value=12.5,good=true 1763640000123456000
-    plc,device=mixer,name=name text="AB",good=true 1763640000123456000
-    plc,device=mixer,name=recipe value_0=1.0,value_1=5.0,good=true 1763640000123456000
-    plc,device=mixer,name=speed good=false,reason="no-reply" 1763640003500000000
-    plc_bridge lost=120i,refused=0i 1763640010000000000
+    plc_bridge lost=120i,refused=0i,recovered=118i 1763640010000000000
 
-* A value at an end of its clamp has `limited="low"` or `limited="high"`.
-* An array has a field for each element, `value_0`, `value_1` ...
-* Numbers and bits (0, 1) are in `value`, texts and the names of an `enum` in `text`. Beyond 2^53 a
-  number is exact in `text` only.
-* The time is that of the sample. A value that becomes good again without a new sample has the time
-  of its return.
-* An uncertain sample, outside the range of its sensor, has its value and `good=false`.
-* A bad sample has no value. A chart of the last value must look at the last `good` too.
-* While the server does not answer, up to `--queue` lines wait. They are sent again with the same
-  time, so that a second copy replaces the first. Beyond that the oldest are lost. Lines that the
-  server refuses (status 400, 413 and 422) are dropped. Both are counted, on the standard error
-  output and in `plc_bridge`. Query the history of the gateway to fill the gap: docs/history.md.
+What is missing is taken from the history of the gateway, for tags that have one: after a loss of
+lines, after a time without the gateway, and with a state file after a restart of the bridge.
 """
 
 import asyncio
@@ -32,57 +19,43 @@ import time
 import urllib.error
 import urllib.request
 from collections import deque
-from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
 
 from gateway.bridges.documents import Known, utc_now
+from gateway.bridges.influx.gaps import Gaps
+from gateway.bridges.influx.lines import line_of
+from gateway.bridges.past import past
 from gateway.bridges.program import Gateways, opened, say
 from gateway.bridges.remote_plant import RemotePlant
+from gateway.errors import GatewayError
 
 BATCH = 5000  # lines of one request
 ANSWER_WITHIN = 10.0  # seconds
 LONGEST_PAUSE = 30.0  # seconds between two attempts
 REFUSED = (400, 413, 422)  # for ever; other errors are those of the server or of its settings
+LOOK_EVERY = 1.0  # seconds: for gaps
 
 
-def line_of(key: str, known: Known) -> str:
-    device, _, tag = key.partition("/")
-    value = known["value"]
-    good = "good=true"
-    if known["quality"] != "good":
-        good = f"good=false,reason={quoted(known.get('reason', ''))}"
-    if value is None:
-        fields = good
-    elif isinstance(value, list):
-        fields = ",".join(f"value_{n}={float(one)!r}" for n, one in enumerate(value)) + f",{good}"
-    elif isinstance(value, str):
-        fields = f"text={quoted(value)},{good}"
-    else:
-        fields = f"value={float(value)!r},{good}"
-        if isinstance(value, int) and abs(value) > 2**53:
-            fields += f",text={quoted(str(value))}"
-        elif "text" in known:
-            fields += f",text={quoted(str(known['text']))}"
-    if "limited" in known:
-        fields += f",limited={quoted(known['limited'])}"
-    origin = f",origin={known['origin']}" if "origin" in known else ""
-    nanoseconds = round(datetime.fromisoformat(known["time"]).timestamp() * 1_000_000) * 1000
-    return f"plc,device={device},name={tag}{origin} {fields} {nanoseconds}"
-
-
-def quoted(text: str) -> str:
-    """Returns a field's text; the protocol has no escape for a line's end."""
-    text = " ".join(text.splitlines()).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{text}"'
+class Line(NamedTuple):
+    device: str
+    time: str
+    text: str
 
 
 class Bridge:
-    def __init__(self, to: str | None, every: float, most: int) -> None:
+    """Sends lines in their order, each until the server has answered."""
+
+    def __init__(self, to: str | None, every: float, most: int, state: Path | None) -> None:
+        self.plant: RemotePlant
         self._to, self._every, self._most = to, every, most
-        self._lines: deque[str] = deque()
+        self._lines: deque[Line] = deque()
         self._last: dict[str, tuple[str, bool]] = {}  # of each key: time, is good
+        self._gaps = Gaps(state)
         self._news = asyncio.Event()
-        self._lost = self._refused = 0
-        self._said = (0, 0)
+        self._lost = self._refused = self._recovered = 0
+        self._said = (0, 0, 0)
+        self._sends = True
 
     def described(self, _key: str, _meta: Known) -> None:
         pass
@@ -94,24 +67,30 @@ class Bridge:
         if before and is_good and not before[1] and known["time"] <= before[0]:
             known = known | {"time": utc_now()}
         self._last[key] = known["time"], is_good
-        self._lines.append(line_of(key, known))
-        self._drop()
+        device = key.partition("/")[0]
+        self._gaps.heard(device, answers=device in self.plant.trusted)
+        self._add(key, known)
+        while len(self._lines) > self._most:
+            self._lose(self._lines.popleft())
+
+    def _add(self, key: str, known: Known) -> None:
+        self._lines.append(Line(key.partition("/")[0], known["time"], line_of(key, known)))
         self._news.set()
 
-    def _drop(self) -> None:
-        while len(self._lines) > self._most:
-            self._lines.popleft()
-            self._lost += 1
+    def _lose(self, line: Line) -> None:
+        self._lost += 1
+        self._gaps.open(line.device, line.time)
 
     async def serve(self) -> None:
-        """Sends the lines in batches, in their order, each until the server has answered."""
+        """Sends the lines in batches."""
         pause = self._every
         while True:
             await self._news.wait()
             await asyncio.sleep(pause)
             self._news.clear()
             while self._lines:
-                if not await self._send():
+                self._sends = await self._send()
+                if not self._sends:
                     pause = min(2 * pause, LONGEST_PAUSE)
                     self._news.set()
                     break
@@ -120,24 +99,28 @@ class Bridge:
     async def _send(self) -> bool:
         """Sends one batch. Returns False if it must be sent again."""
         batch = [self._lines.popleft() for _ in range(min(BATCH, len(self._lines)))]
-        counts = self._lost, self._refused
-        note = f"plc_bridge lost={counts[0]}i,refused={counts[1]}i {time.time_ns()}"
-        body = "\n".join([*batch, *([note] if counts != self._said else [])]) + "\n"
+        counts = self._lost, self._refused, self._recovered
+        fields = "lost={}i,refused={}i,recovered={}i".format(*counts)
+        note = [f"plc_bridge {fields} {time.time_ns()}"] if counts != self._said else []
+        body = "\n".join([*(line.text for line in batch), *note]) + "\n"
         try:
             await asyncio.to_thread(self._post, body.encode())
         except BrokenPipeError:
-            raise SystemExit("the standard output is closed") from None
+            raise GatewayError("the standard output is closed") from None
         except (OSError, http.client.HTTPException) as error:
             if isinstance(error, urllib.error.HTTPError) and error.code in REFUSED:
                 self._refused += len(batch)
                 say(f"{len(batch)} lines refused: {error}, {error.read(300)!r}")
                 return True
             self._lines.extendleft(reversed(batch))
-            self._drop()
+            while len(self._lines) > self._most:
+                self._lose(self._lines.popleft())
             say(f"not sent: {error}; {len(self._lines)} lines wait, {self._lost} are lost")
             return False
-        if counts != self._said:
-            say(f"{counts[0]} lines lost and {counts[1]} refused since the start")
+        for line in batch:
+            self._gaps.sent(line.device, line.time)
+        if note:
+            say(f"since the start: {fields}")
             self._said = counts
         return True
 
@@ -153,12 +136,49 @@ class Bridge:
         with urllib.request.urlopen(request, timeout=ANSWER_WITHIN):  # noqa: S310
             pass
 
+    async def recover(self) -> None:
+        """Fills gaps from the history, while the server takes lines."""
+        while True:
+            await asyncio.sleep(LOOK_EVERY)
+            await self._gaps.save()
+            for device in sorted(self.plant.trusted) if self._sends else ():
+                if since := self._gaps.take(device):
+                    await self._recover(device, since)
 
-async def bridge(gateways: Gateways, to: str | None, every: float, queue: int) -> None:
+    async def _recover(self, device: str, since: str) -> None:
+        tags = [
+            key
+            for key, meta in self.plant.tags.items()
+            if meta["history"] and key.startswith(f"{device}/")
+        ]
+        before = self._recovered
+        try:
+            for key in tags:
+                async for found in past(self.plant, key, f"[{since}..]"):
+                    for known in found:
+                        self._add(key, known)
+                    self._recovered += len(found)
+                    while len(self._lines) > BATCH:  # live lines go on, and none is lost for old
+                        await asyncio.sleep(self._every)
+        except GatewayError as error:
+            say(f"history of {device} since {since}: {error}; again later")
+            self._gaps.open(device, since)
+        else:
+            while self._lines:
+                await asyncio.sleep(self._every)
+            self._gaps.filled(device)
+            if tags:
+                say(f"{self._recovered - before} samples of {device} since {since} recovered")
+
+
+async def bridge(
+    gateways: Gateways, to: str | None, every: float, queue: int, state: Path | None
+) -> None:
     """Serves until it is cancelled."""
-    served = Bridge(to, every, queue)
+    served = Bridge(to, every, queue, state)
     with await opened(gateways) as session:
-        plant = RemotePlant(session, gateways.prefix, served.described, served.changed)
+        served.plant = RemotePlant(session, gateways.prefix, served.described, served.changed)
         async with asyncio.TaskGroup() as group:
-            group.create_task(plant.follow())
+            group.create_task(served.plant.follow())
             group.create_task(served.serve())
+            group.create_task(served.recover())
