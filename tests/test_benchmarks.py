@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scenario_clients, scenarios
-from tests.conftest import needs
+from tests.conftest import lacking, needs
 from tests.e2e.processes import ROOT
 
 # Program, its smallest sizes, and a pattern for each row of figures that it must print.
@@ -171,6 +171,21 @@ def test_the_consumer_finds_what_is_wrong() -> None:
     assert scenario_clients.in_uint32(right + 1, 5) is None  # halves of two replies
 
 
+def test_the_doors_are_measured() -> None:
+    for program in ("gcc", "mbpoll", "pkg-config"):
+        needs(program)
+    if subprocess.run(["pkg-config", "--exists", "libmodbus"], check=False).returncode:
+        lacking("libmodbus-dev is not installed")
+    text = printed("doors", "--seconds", "0.3", "--programs", "mbpoll")
+    assert re.search(r"^mbpoll .* polls +\d+, .* lost", text, re.MULTILINE), text
+
+
 def test_every_benchmark_is_run() -> None:
     found = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    assert found == {*(row[0] for row in TINY), "pictures", *BY_OTHER_TESTS, *PARTS_OF_OTHERS}
+    assert found == {
+        *(row[0] for row in TINY),
+        "pictures",
+        "doors",
+        *BY_OTHER_TESTS,
+        *PARTS_OF_OTHERS,
+    }

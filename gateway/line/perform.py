@@ -262,9 +262,9 @@ async def _resync_after(write: Write, span: Span, token: int, talk: Transaction)
         near = span if write.tag.polled else None
         await device.driver.resync(talk, near, token, device.probe_spans)
     except Refused:
-        if device.last_read is None:
+        if device.good_reads.last is None:
             raise
-        await device.driver.read(talk, device.last_read)
+        await device.driver.read(talk, device.good_reads.last)
 
 
 async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:

@@ -194,6 +194,23 @@ def test_half_of_the_use_of_the_wire_is_forgotten_every_ten_seconds() -> None:
     assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)
 
 
+def test_the_widest_block_gives_the_proof_when_a_narrow_one_was_read_last() -> None:
+    """Single registers have one shape: many unanswered reads of them are told apart by it."""
+    driver, narrow = ModbusRtu(station=1), Span("holding", 0, 1)
+    tags = [make_tag(f"holding:{n}", driver) for n in (0, *range(100, 150, 5))]
+    dev = made_device("plc", driver, WIRE, driver.timing, tags)
+    dev.good_reads.note(narrow)
+    dev.health.unclear(NoReply("silence"), narrow, 0.0, known=True)
+    assert not dev.may_be_proven(0.0)
+    dev.good_reads.note(Span("holding", 100, 46))
+    dev.good_reads.note(narrow)
+    assert dev.may_be_proven(0.0)
+    dev.good_reads.replan()
+    assert dev.may_be_proven(0.0)  # a resync may be under way: its reads stay the same
+    dev.good_reads.note(narrow)
+    assert not dev.may_be_proven(0.0)
+
+
 @pytest.mark.parametrize(
     ("asked", "known", "proven"),
     [

@@ -1,16 +1,18 @@
-"""Doors of a line with faults: a short slice of `python -m tests.sim.doors`."""
+"""Doors of a line with faults: a short slice of `make sim PACE=doors`."""
 
-import pytest
+from collections import Counter
 
 from tests.sim.doors import run
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_no_program_and_no_tag_gets_what_belongs_to_another(seed: int) -> None:
-    world = run(seed, 300.0)
-    assert world.wrong == []
-    assert world.found["read"] > 50
-    assert world.found["written"] > 20
-    assert world.found["value"] > 100
-    assert world.found["wire lent"] > 0
-    assert world.found["reload"] > 0
+def test_no_program_and_no_tag_gets_what_belongs_to_another() -> None:
+    found = Counter[str]()
+    for seed in range(2):
+        world = run(seed, 300.0)
+        assert world.wrong == []
+        found += world.found
+    assert found["read"] > 100
+    assert found["written"] > 40
+    assert found["value"] > 200
+    faults = ("wire lent", "reload", "stall", "held", "doubts", "standby", "vanish")
+    assert [one for one in faults if not found[one]] == []

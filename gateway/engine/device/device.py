@@ -10,7 +10,7 @@ from gateway.engine.device.health import Health, State, diagnosis
 from gateway.engine.device.identity import Identity
 from gateway.engine.device.monitor_list import MonitorList
 from gateway.engine.device.records import Record
-from gateway.engine.device.reply_shapes import MOST_HELD, ReplyShapes, reply_shapes
+from gateway.engine.device.reply_shapes import MOST_HELD, GoodReads, ReplyShapes, reply_shapes
 from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.device.turnaround import Turnaround
 from gateway.errors import Evidence, Garbled, LineDown, NoReply
@@ -49,7 +49,7 @@ class Device:
     bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
-    last_read: Span | None = None  # the last block that was read
+    good_reads: GoodReads = field(default_factory=GoodReads)
     monitor: MonitorList = field(default_factory=MonitorList)
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: StationSilence = field(init=False)
@@ -172,7 +172,8 @@ class Device:
         """Takes over the state of the same station. No request to it may be in flight."""
         self.health, self.record, self.use = old.health, old.record, old.use
         self.health.resyncs_elsewhere()
-        self.last_read, self.one_at_a_time = old.last_read, old.one_at_a_time
+        self.good_reads.take_over(old.good_reads)
+        self.one_at_a_time = old.one_at_a_time
         if self.settings.identity == old.settings.identity:
             self.identity = old.identity
         if (old.silence.safe, old.silence.least) == (self.silence.safe, self.silence.least):
@@ -241,6 +242,7 @@ class Device:
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
+        self.good_reads.replan()
         bad.changed.clear()
         if self.shapes is not None:
             self.shapes.longer.planned(blocks)
@@ -273,6 +275,7 @@ class Device:
             if len(tags) * rates >= MOST_PLANNED:
                 break
         kept = [block for place, block in enumerate(blocks) if place not in near]
+        self.good_reads.replan()
         found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
         if self.shapes is not None:
@@ -350,7 +353,8 @@ class Device:
 
     @property
     def probe_spans(self) -> Sequence[Span]:
-        """Configured addresses for a resync, those of the last good read first.
+        """Configured addresses for a resync, those of the last good read first, then the widest
+        block that was read: it has room for a read with a form of its own.
 
         They stay the same from one good read to the next, as `Driver.resync` needs it.
         """
@@ -358,7 +362,7 @@ class Device:
         bad = {tag for one in self.bad_addresses.bad.values() for tag in one.tags}
         runs = runs_of([tag for tag in tags if tag not in bad] or tags)
         some = runs[:: 1 + len(runs) // MOST_PROBED]
-        return some if self.last_read is None else (self.last_read, *some)
+        return (*self.good_reads.spans, *some)
 
     def may_be_proven(self, now: float) -> bool:
         """Returns True if a resync with the token `PROOF` has a reply that no unanswered request

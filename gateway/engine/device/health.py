@@ -155,12 +155,19 @@ class Health:
         self.unanswered.clear()
 
     def unclear(
-        self, error: DeviceError, outstanding: Span | None, now: float, *, known: bool = False
+        self,
+        error: DeviceError,
+        outstanding: Span | None,
+        now: float,
+        *,
+        known: bool = False,
+        resynced: bool = False,
     ) -> None:
         """Notes a transaction without a reply, which may still arrive.
 
         `outstanding`: the requested span. None for a probe: an older span stays outstanding.
-        `known`: its reply has the shape of that span, or one of all resyncs.
+        `known`: its reply has the shape of that span, of an acknowledgement, or one of all resyncs.
+        `resynced`: a resync went with it.
         """
         if self.state is not State.OFFLINE:
             self._asked_at = now
@@ -174,6 +181,7 @@ class Health:
             self.unanswered.sent.append(now)
         else:
             self.unanswered.add(outstanding if known else None, now)
+            self.unanswered.either += known and resynced
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
         self.needs_resync = self.answerable

@@ -7,7 +7,7 @@ addresses more. An extra reply then arrives as a stray frame.
 """
 
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 from gateway.engine.device.long_writes import LongWrite
@@ -25,6 +25,33 @@ MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire 
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
+
+
+@dataclass(slots=True)
+class GoodReads:
+    """Blocks that the device has replied to: the last one, and the widest of its plan."""
+
+    last: Span | None = None
+    widest: Span | None = None
+    replanned: bool = False  # the next good read begins again: no resync is under way then
+
+    def take_over(self, old: "GoodReads") -> None:
+        """Takes over the last block of the same station with another plan."""
+        self.last = old.last
+
+    def replan(self) -> None:
+        """Notes another plan."""
+        self.replanned = True
+
+    def note(self, span: Span) -> None:
+        self.last = span
+        if self.widest is None or self.replanned or span.size > self.widest.size:
+            self.widest, self.replanned = span, False
+
+    @property
+    def spans(self) -> Iterable[Span]:
+        """The last block, then the widest, unless it is the same."""
+        return dict.fromkeys(span for span in (self.last, self.widest) if span is not None)
 
 
 @dataclass(slots=True)

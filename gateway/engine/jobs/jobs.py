@@ -9,7 +9,7 @@ from gateway.engine.device.health import State
 from gateway.engine.jobs.requests import Command, Request, Write
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import PROOF, Span
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +169,24 @@ def span_of(job: Unfinished) -> Span | None:
             return run
         case Repeat(write=write):
             return write.tag.span
+        case Command(span=span):
+            return span
     return None
+
+
+def may_be_told(job: Unfinished) -> tuple[bool, bool]:
+    """Returns True if a late reply to the job has the shape of `span_of`, of a resync or of an
+    acknowledgement; and True if a resync went with it."""
+    match job:
+        case Poll():
+            return True, False
+        case Probe():
+            return job.token != PROOF, False
+        case Write(tag=tag, long=None):
+            return tag.polled, True
+        case Command(span=Span()):
+            return True, True
+    return False, False
 
 
 # Results

@@ -60,10 +60,11 @@ class HealthRules:
         time: int,
         *,
         known: bool = False,
+        resynced: bool = False,
     ) -> State:
         """Applies an unclear transaction. Returns the state of the device before it."""
         before = device.health.state
-        device.health.unclear(error, asked, now, known=known)
+        device.health.unclear(error, asked, now, known=known, resynced=resynced)
         device.record.count_failure(error)
         device.monitor.forget()  # the device may have restarted
         name, why = device.name, str(error)

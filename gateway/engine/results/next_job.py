@@ -20,6 +20,7 @@ from gateway.engine.jobs.jobs import (
     Transacted,
     Unfinished,
     WriteTogether,
+    may_be_told,
     span_of,
 )
 from gateway.engine.jobs.poll_entry import PollEntry
@@ -179,8 +180,10 @@ class NextJob:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
         self.proofs.release(now, time, proven=False)
-        known = isinstance(job, Poll) or (isinstance(job, Probe) and job.token != PROOF)
-        before = self._results.unclear(device, error, span_of(job), now, time, known=known)
+        asked, (known, resynced) = span_of(job), may_be_told(job)
+        before = self._results.unclear(
+            device, error, asked, now, time, known=known, resynced=resynced
+        )
         no_guard = before is State.OFFLINE or _is_short(job) or self._is_lost(job, error, now)
         settle = Settle(
             device,

@@ -58,7 +58,7 @@ class PollRules:
         if shapes is not None and shapes.longer.failed and poll.job.span is not block.span:
             shapes.longer.answered(block.span)
         if not block.listed:
-            device.last_read = block.span  # the device has these addresses
+            device.good_reads.note(block.span)
         samples = self._schedule.read(poll, units, now, time)
         self._effects.collected.append(Samples(samples))
         if block.of_fields:

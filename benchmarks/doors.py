@@ -1,0 +1,247 @@
+"""Other makers' programs at the doors of a polled line: `python -m benchmarks.doors`.
+
+A gateway polls 300 registers of libmodbus' slave behind a wire of 19200 baud. Programs use its
+doors: mbpoll, libmodbus' master, npm's modbus-serial and pymodbus, alone and two at once, and two
+that ask for 125 registers without a pause. The wire itself counts the polls. It prints how many
+were lost against the same time without programs, and the longest time between two reads of one
+block, beside the worst age that `check` prints.
+"""
+
+import argparse
+import asyncio
+import itertools
+import json
+import os
+import re
+import select
+import struct
+import subprocess
+import tempfile
+import threading
+import time
+import tty
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from multiprocessing import Pipe, Process
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from pymodbus import FramerType
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.exceptions import ModbusIOException
+
+from tests.e2e.processes import free_port, plc_gateway, started, write_config
+from tests.interop.peers import HERE, finished, running
+from tests.zenoh_peer import free_endpoint
+
+BAUD, BITS = 19200, 10
+TURNAROUND = 0.005  # seconds
+BLOCKS, SIZE = 10, 30
+FIRST, APART = 2000, 200  # polled registers; programs ask for others
+
+
+class Wire:
+    """Two ptys with a wire between them, in a process of its own."""
+
+    def __init__(self) -> None:
+        self._ends = [os.openpty() for _ in range(2)]
+        for _, slave in self._ends:
+            tty.setraw(slave)
+        self.gateway, self.plc = (os.ttyname(slave) for _, slave in self._ends)
+        self._polls, theirs = Pipe()
+        self._process = Process(target=self._carry, args=(theirs,), daemon=True)
+        self._process.start()
+        self._found = list[tuple[float, int]]()
+        threading.Thread(target=self._note, daemon=True).start()
+
+    def _note(self) -> None:
+        """Takes the reports: the wire waits for none."""
+        with suppress(EOFError):
+            while True:
+                self._found.append(self._polls.recv())
+
+    def _carry(self, polls: Connection) -> None:
+        """Passes bytes on when their last character has passed, and reports each poll."""
+        ours, theirs = (master for master, _ in self._ends)
+        while True:
+            for end in select.select([ours, theirs], [], [])[0]:
+                began, data = time.monotonic(), os.read(end, 4096)
+                if end == ours and (block := _block(data)) is not None:
+                    polls.send((began, block))
+                pause = len(data) * BITS / BAUD + (TURNAROUND if end == theirs else 0.0)
+                time.sleep(max(0.0, began + pause - time.monotonic()))
+                os.write(theirs if end == ours else ours, data)
+
+    def polls(self) -> list[tuple[float, int]]:
+        """Returns the time and the block of each poll since the last call."""
+        found, self._found = self._found, []
+        return found
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.join()
+
+
+def _block(request: bytes) -> int | None:
+    """Returns the block that a request polls, which begins a register before it at times."""
+    if len(request) != 8 or request[1] != 3:
+        return None
+    first, count = struct.unpack_from(">HH", request, 2)
+    return (first - FIRST + 10) // APART if first > FIRST - 10 and count >= SIZE else None
+
+
+def plant(folder: Path, port: str, doors: Sequence[int]) -> Path:
+    tags = {
+        f"t{n}": {"address": f"holding:{FIRST + n // SIZE * APART + n % SIZE}"}
+        for n in range(BLOCKS * SIZE)
+    }
+    share = {
+        protocol: {
+            "line": "hall",
+            "listen": f"127.0.0.1:{number}",
+            "protocol": protocol,
+            "reply_within": "5s",
+            "writes": {"press": ["holding:100..holding:163", "coil:16..coil:36"]},
+        }
+        for protocol, number in zip(("modbus-tcp", "modbus-rtu"), doors, strict=True)
+    }
+    press = {"protocol": "modbus-rtu", "station": 1, "tags": tags, "defaults": {"every": "1s"}}
+    hall = {"port": port, "baudrate": BAUD, "format": "8N1", "devices": {"press": press}}
+    return write_config(
+        folder / "hall.yaml", free_endpoint(), {"hall": hall}, share={"doors": share}
+    )
+
+
+class Programs:
+    """The programs, by name: each works until it is cancelled, and counts its requests.
+
+    A request without a reply counts as such; a wrong value ends the benchmark.
+    """
+
+    def __init__(self, libmodbus: Path, tcp: int, rtu: int) -> None:
+        self._master, self._tcp, self._rtu = libmodbus, str(tcp), rtu
+        self.requests = self.unanswered = 0
+
+    async def _run(self, requests: int, *command: str | Path) -> str:
+        """Returns the output of a program; empty if it got no reply."""
+        try:
+            out = await finished(*command)
+        except AssertionError as error:
+            if not re.search("[Tt]imed out|failed to respond|Timed Out", str(error)):
+                raise
+            self.unanswered += 1
+            return ""
+        self.requests += requests
+        return out
+
+    async def mbpoll(self) -> None:
+        ask = ("mbpoll", "-m", "tcp", "-p", self._tcp, "-0", "-1", "-a", "1", "-o", "5")
+        while True:
+            out = await self._run(1, *ask, "-t", "4", "-r", "500", "-c", "20", "127.0.0.1")
+            assert not out or "[519]: \t519" in out, out
+
+    async def libmodbus(self) -> None:
+        while True:
+            await self._run(20, self._master, "tcp", self._tcp, "1", "20")
+
+    async def modbus_serial(self) -> None:
+        program = HERE / "modbus_serial_client.js"
+        while True:
+            out = await self._run(7, "node", program, self._tcp, "1", "tcp")
+            assert not out or json.loads(out)["words"] == [1, 2, 65535, 0xBEEF], out
+
+    async def pymodbus(self, first: int = 700, count: int = 50) -> None:
+        client = AsyncModbusTcpClient(
+            "127.0.0.1", port=self._rtu, framer=FramerType.RTU, timeout=10
+        )
+        assert await client.connect()
+        try:
+            while True:
+                try:
+                    found = await client.read_holding_registers(first, count=count, device_id=1)
+                except ModbusIOException:
+                    self.unanswered += 1
+                    continue
+                assert found.registers == [*range(first, first + count)], found
+                self.requests += 1
+        finally:
+            client.close()
+
+    async def flood(self) -> None:
+        await asyncio.gather(self.pymodbus(200, 125), self.pymodbus(400, 125))
+
+    async def both(self) -> None:
+        await asyncio.gather(self.libmodbus(), self.pymodbus())
+
+    async def none(self) -> None:
+        await asyncio.Event().wait()
+
+
+def built(folder: Path) -> tuple[Path, Path]:
+    """Returns libmodbus' slave and master."""
+    flags = subprocess.run(
+        ["pkg-config", "--cflags", "--libs", "libmodbus"], check=True, stdout=subprocess.PIPE
+    )
+    for name in ("modbus_slave", "modbus_master"):
+        command = ["gcc", "-O2", "-o", str(folder / name), str(HERE / f"{name}.c")]
+        subprocess.run([*command, *flags.stdout.decode().split()], check=True)
+    return folder / "modbus_slave", folder / "modbus_master"
+
+
+async def counted(
+    wire: Wire, work: Callable[[], Awaitable[None]], seconds: float
+) -> tuple[int, float]:
+    """Returns the polls in so many seconds, and the longest time between two of one block."""
+    task = asyncio.ensure_future(work())
+    await asyncio.sleep(min(2.0, seconds))  # the program has begun
+    wire.polls()
+    done, _ = await asyncio.wait([task], timeout=seconds)
+    polls = wire.polls()
+    for one in done:
+        one.result()
+    task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
+    times = defaultdict[int, list[float]](list)
+    for at, first in polls:
+        times[first].append(at)
+    gaps = (b - a for row in times.values() for a, b in itertools.pairwise(row))
+    return len(polls), max(gaps, default=0.0)
+
+
+async def measured(names: Sequence[str], seconds: float, folder: Path) -> None:
+    slave, master = built(folder)
+    wire, ports = Wire(), (free_port(), free_port())
+    file = plant(folder, wire.gateway, ports)
+    print(plc_gateway("check", file).out)
+    async with running(slave, "rtu", wire.plc, "1", ready=b"ready"):
+        with started(file) as gateway:
+            gateway.says("device online", "press")
+            programs, alone = Programs(master, *ports), 0
+            await asyncio.sleep(min(5.0, seconds))
+            for name in ("none", *names):
+                programs.requests = programs.unanswered = 0
+                polls, longest = await counted(wire, getattr(programs, name), seconds)
+                alone = alone or polls
+                rate, lost = programs.requests / seconds, 1 - polls / (alone or 1)
+                print(
+                    f"{name:<13} {rate:5.1f} requests/s, {programs.unanswered} unanswered; "
+                    f"polls {polls:5}, {lost:6.1%} lost, {longest:.2f} s between two of a block"
+                )
+            gateway.lines.clear()
+    wire.end()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    every = ["mbpoll", "libmodbus", "modbus_serial", "pymodbus", "both", "flood"]
+    parser.add_argument("--programs", nargs="+", default=every, choices=every)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        asyncio.run(measured(asked.programs, asked.seconds, Path(folder)))
+
+
+if __name__ == "__main__":
+    main()
