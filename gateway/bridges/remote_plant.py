@@ -6,7 +6,7 @@ turn good again by values that arrive after the token has returned, never by old
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 
 import orjson
@@ -16,10 +16,12 @@ from gateway.bridges.documents import Known, bad, copied, described_by, parsed
 from gateway.bridges.presence import Presence
 from gateway.bridges.program import say
 from gateway.bridges.requests import Inbox, Requests
+from gateway.errors import GatewayError
 
 QUERY_EVERY = 60.0  # seconds between two queries of all values without a known reason
 RETRY_AFTER = 0.5  # seconds, doubled up to QUERY_EVERY while values are missing
 SETTLE = 0.1  # seconds
+PAGE = 10_000  # samples of the history
 
 
 class RemotePlant:
@@ -192,3 +194,25 @@ class RemotePlant:
         if key in self.tags:
             return await self.requests.write(key, value, time)
         return {"outcome": "no-gateway", "reason": "no gateway has described this tag"}
+
+    async def past(self, key: str, bounds: str) -> AsyncIterator[list[Known]]:
+        """Yields the samples of a tag in a range of `_time`, page by page.
+
+        Only the end of a page tells whether all of it has arrived. Raises `GatewayError` where it
+        has not.
+        """
+        after, is_complete = "", False
+        while not is_complete:
+            replies = await self.requests.ask(
+                f"{key}?_time={bounds};page={PAGE}{after}", accept_replies=zenoh.ReplyKeyExpr.ANY
+            )
+            *found, last = [reply.ok for reply in replies] or [None]
+            if last is None or not str(last.key_expr).endswith("/page"):
+                raise GatewayError("no gateway has answered")
+            page = orjson.loads(last.payload.to_bytes())
+            read = [self.read(key, *copied(sample)[1:]) for sample in found if sample]
+            if page["samples"] != len(read):
+                raise GatewayError("not all samples have arrived")
+            yield [known for known in read if known]
+            is_complete = page["complete"]
+            after = f";after={page['next']}"

@@ -25,7 +25,6 @@ from typing import NamedTuple
 from gateway.bridges.documents import Known, utc_now
 from gateway.bridges.influx.gaps import Gaps
 from gateway.bridges.influx.lines import line_of
-from gateway.bridges.past import past
 from gateway.bridges.program import Gateways, opened, say
 from gateway.bridges.remote_plant import RemotePlant
 from gateway.errors import GatewayError
@@ -154,7 +153,7 @@ class Bridge:
         before = self._recovered
         try:
             for key in tags:
-                async for found in past(self.plant, key, f"[{since}..]"):
+                async for found in self.plant.past(key, f"[{since}..]"):
                     for known in found:
                         self._add(key, known)
                     self._recovered += len(found)
