@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from benchmarks.start import Sizes, rows
+from tests.cli.bench_page import BenchPage, benched, shown
 from tests.e2e.processes import ROOT, free_port, plc_gateway, started
 from tests.web.browser import Tab, browser
 from tests.web.serving import TOKEN
@@ -34,6 +35,7 @@ VIEWS = {
 }
 LARGE = Sizes(10, 5, 100)
 DOCS = {
+    "bench.png": "bench-laptop-light.png",
     "page.png": "fault-overview-laptop-light.png",
     "page-phone.png": "many-overview-phone-dark.png",
     "page-trend.png": "well-trend-laptop-dark.png",
@@ -193,7 +195,6 @@ READY["search"] = READY["tags"]
 
 
 async def look(situations: list[tuple[str, Path, int]], arguments: argparse.Namespace) -> None:
-    arguments.into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:  # it ends late
         async with browser(arguments.chromium, Path(profile)) as tab:
             for name, _, port in situations:
@@ -201,7 +202,28 @@ async def look(situations: list[tuple[str, Path, int]], arguments: argparse.Name
             assert tab.errors == []
 
 
+async def look_at_bench(arguments: argparse.Namespace) -> None:
+    """The bench with a change that is not kept yet."""
+    async with AsyncExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+        addresses, _ = await stack.enter_async_context(benched(folder / "plant.yaml"))
+        tab = await stack.enter_async_context(browser(arguments.chromium, folder / "profile"))
+        page = BenchPage(tab)
+        for size in arguments.sizes:
+            for scheme in arguments.schemes:
+                await tab.look(*SIZES[size], dark=scheme == "dark")
+                if not page.clicks:
+                    await page.named(await addresses.get())
+                    await page.click("#apply", f"{shown('#good')} === '20 of 20 values are good'")
+                    await tab.value("document.querySelectorAll('.name')[24].value = 'recipe'")
+                    await page.click("#add-tags", f"{shown('#size')} === '21 tags on 1 line'")
+                await tab.screenshot(arguments.into / f"bench-{size}-{scheme}.png")
+        assert tab.errors == []
+
+
 async def run(arguments: argparse.Namespace) -> None:
+    arguments.into.mkdir(parents=True, exist_ok=True)
+    await look_at_bench(arguments)
     ports = Ports()
     async with AsyncExitStack() as stack:
         await ports.serve(stack)

@@ -19,6 +19,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "D100..D119 --port /dev/ttyUSB0 --protocol vigor --station 1",
     ),
     "new": ("plant.yaml", "plant.yaml --port /dev/ttyUSB0 --protocol vigor --tags tags.csv"),
+    "bench": ("plant.yaml", "plant.yaml --at 8001"),
     "import": ("tags.csv", "tags.xlsx --into plant.yaml --device mixer"),
     "export": ("plant.yaml --output tags.csv", "plant.yaml mixer --decimal-comma"),
     "simulate": ("plant.yaml --tcp 127.0.0.1:5020", "plant.yaml --links /tmp/plant"),

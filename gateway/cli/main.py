@@ -32,6 +32,7 @@ _COMMANDS = {
     "scan": "line.scan_command:scan",
     "peek": "line.peek:peek",
     "new": "config.new:new",
+    "bench": "bench.command:bench",
     "import": "sheets.import_command:import_",
     "export": "sheets.export:export",
     "simulate": "line.simulate:simulate",

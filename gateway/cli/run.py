@@ -28,6 +28,7 @@ from gateway.transport.loop import new_event_loop
 from gateway.values import Kind
 
 log = structlog.get_logger("gateway")
+STARTED = "Ctrl-C ends it."  # the last line of what a started gateway says to people
 
 
 def run(
@@ -106,7 +107,7 @@ def next_steps(config: Config, path: Path, command: str) -> str:
         if tag.write is not None and tag.element is None:
             lines.append(f"  {command} write {file} {tag.key} {_example(tag)}")
             break
-    lines.append("Ctrl-C ends it.")
+    lines.append(STARTED)
     return "\n".join(lines)
 
 

@@ -32,17 +32,19 @@ def load(
     path: str | Path,
     report: Callable[[str, float], None] | None = None,
     imports: Mapping[str, tuple[Path, Grid]] | None = None,
+    text: str | None = None,
 ) -> Config:
     """Reads and checks the file. Paths in it are relative to its folder; those of files that the
     gateway writes are relative to `state_folder()`, if there is one.
 
     `report` receives the name of each step and the share of it that is done. `imports`: a sheet
-    with more tags, by device. Raises `ConfigErrors` with every mistake.
+    with more tags, by device. `text`: what the file is going to have.
+    Raises `ConfigErrors` with every mistake.
     """
     read = None if report is None else partial(report, f"reading {Path(path).name}")
     checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
-        file, mistakes = read_yaml(Path(path), TEXTS, read)
+        file, mistakes = read_yaml(Path(path), TEXTS, read, text)
         builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
         data = expanded(file, mistakes, Path(path).parent)
         config = builder.config(data)

@@ -91,7 +91,7 @@ async def test_who_begins_no_handshake_closes_the_page_to_nobody(
 async def test_a_renewed_certificate_is_taken_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.parts.web.server.RENEWED", 0.01)
+    monkeypatch.setattr("gateway.parts.web.listener.RENEWED", 0.01)
     (old := tmp_path / "old").mkdir()
     (new := tmp_path / "new").mkdir()
     certificate, key = certificates(old)("hall")

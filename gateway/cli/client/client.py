@@ -183,7 +183,10 @@ class Client:
         return self._request(key, text.encode(), self._tags_of(device), dialling)
 
     def _tags_of(self, device: str) -> str:
-        """One description of a device: only its gateway replies."""
+        """One description of a device, or its state where it has no tag: only its gateway
+        replies."""
+        if not any(tag.device == device for tag in self._tags.values()):
+            return self._keys.status(f"devices/{device}")
         return self._keys.meta(f"{device}/**") + "?page=1"
 
     def follow(self, wanted: list[str]) -> Generator[TagRow, None, None]:

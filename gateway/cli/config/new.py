@@ -26,18 +26,20 @@ from gateway.protocols.registry import PROTOCOLS
 from gateway.transport import SerialSettings
 
 _PORTS = ("serial/by-id/*", "ttyUSB*", "ttyACM*", "ttyAMA*")
+LISTEN = "tcp/127.0.0.1:7447"
 _TOP = """\
-# Written by `plc-gateway new` on {day}. docs/configuration.md has every setting.
+# Written by plc-gateway on {day}. docs/configuration.md has every setting.
 
 gateway:
   name: {name}                      # this gateway's own name in its keys
 zenoh:
   prefix: plant                   # the beginning of every key: plant/<device>/<tag>
-  listen: [tcp/127.0.0.1:7447]    # this machine only; tcp/0.0.0.0:7447: the whole network
+  listen: [{listen}]    # this machine only; tcp/0.0.0.0:7447: the whole network
 defaults:
   every: {every:<24} # how often a tag is read; a tag may have its own
 lines:
-  {line}:
+"""
+_LINE = """  {line}:
     port: {port}
 """
 _SERIAL = """\
@@ -127,13 +129,26 @@ def document(
 
     `baud`: of the wire behind a device server.
     """
-    text = _TOP.format(
-        day=date.today().isoformat(),  # noqa: DTZ011  (the date of the person who reads it)
-        name=written(gateway),
-        every=every,
-        line=written(line),
-        port=written(port),
-    )
+    return head_text(gateway, every) + line_text(line, port, devices, baud)
+
+
+def head_text(gateway: str, every: str = "1s", listen: str = LISTEN) -> str:
+    """Returns the text of a configuration before its first line."""
+    day = date.today().isoformat()  # noqa: DTZ011  (the date of the person who reads it)
+    return _TOP.format(day=day, name=written(gateway), every=every, listen=listen)
+
+
+def line_text(
+    line: str,
+    port: str,
+    devices: Sequence[NamedStation],
+    baud: str | None = None,
+    *,
+    simulated: bool = False,
+) -> str:
+    """Returns the text of a line as it stands below `lines:`."""
+    text = _LINE.format(line=written(line), port=written(port))
+    text += "    origin: simulated\n" if simulated else ""
     serial: SerialSettings | None = devices[0].found.serial
     if serial is not None:
         text += _SERIAL.format(baudrate=serial.baudrate, format=serial.format)
@@ -163,8 +178,12 @@ def _asked(option: str, question: str, given: str | None, usual: str | None = No
     return usual
 
 
+def serial_ports() -> list[str]:
+    return [str(path) for pattern in _PORTS for path in sorted(Path("/dev").glob(pattern))]
+
+
 def _ports() -> str:
-    found = [str(path) for pattern in _PORTS for path in sorted(Path("/dev").glob(pattern))]
+    found = serial_ports()
     return f" ({', '.join(found)})" if found else " (such as /dev/ttyUSB0 or tcp://10.0.0.7:4001)"
 
 

@@ -74,7 +74,7 @@ def peek(
     view = view_of(config, text, parsers.interval(every))
     set_up(LogFormat.TEXT, LogLevel.ERROR)
     with _gateway(Path(arguments[0]) if len(arguments) == 3 else None) as client:
-        ask = None if client is None else partial(_asked, client, view, text)
+        ask = None if client is None else partial(asked, client, view, text)
         if watch:
             with suppress(KeyboardInterrupt):
                 asyncio.run(_follow(view, ask))
@@ -107,7 +107,7 @@ def _gateway(config: Path | None) -> Iterator[Client | None]:
         yield found
 
 
-def _asked(client: Client, view: "View", text: str) -> list[Sample]:
+def asked(client: Client, view: "View", text: str) -> list[Sample]:
     """Returns what the gateway reads now. Raises `GatewayError`."""
     device = view.tags[0].device
     answer = client.peek(device, text)
@@ -127,7 +127,7 @@ def _target(
         if given or settings:
             raise ConfigError("with a file, its settings are used: leave out --port and the others")
         loaded = load(Path(arguments[0]))
-        return _only(loaded, arguments[1]), arguments[2]
+        return only(loaded, arguments[1]), arguments[2]
     if len(arguments) != 1:
         raise ConfigError("write a RANGE such as D100..D119, or CONFIG DEVICE RANGE")
     return one_device(options, settings), arguments[0]
@@ -160,7 +160,7 @@ def given_settings(texts: Sequence[str], example: str) -> dict[str, object]:
     return found
 
 
-def _only(config: Config, name: str) -> Config:
+def only(config: Config, name: str) -> Config:
     others = {device.name for device in config.devices} - {name}
     left = config.without(others)
     if not left.devices:
@@ -230,15 +230,20 @@ def view_of(config: Config, text: str, every: float = 1.0) -> View:
         unit_tag(device.name, driver, Address(area, number), f"{area}{number}", every)
         for number in numbers
     ]
-    names = {
-        number: tag.name
-        for tag in reversed(device.tags)
-        if tag.span.area == area
-        for number in range(tag.span.start, tag.span.start + tag.span.size)
-    }
+    names = names_at(device.tags, area)
     peeked = replace(device, tags=tuple(tags), enabled=True)
     lines = (replace(line, devices=(peeked,)),)
     return View(replace(config, lines=lines), tags, unit, driver, names)
+
+
+def names_at(tags: Sequence[Tag], area: str) -> dict[int, str]:
+    """Returns the names of the tags of an area by address."""
+    return {
+        number: tag.name
+        for tag in reversed(tags)
+        if tag.span.area == area
+        for number in range(tag.span.start, tag.span.start + tag.span.size)
+    }
 
 
 async def _poll(view: View, ask: Callable[[], list[Sample]]) -> None:

@@ -40,7 +40,7 @@ def table_of(cells: Sequence[Cell], unit: Unit, text_order: Order, width: int) -
     if unit is Unit.BIT:
         return _bits(cells)
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    columns = _columns(unit, text_order, width)
+    columns = columns_of(unit, text_order, width)
     table.add_column("address", no_wrap=True)
     for column in columns:
         table.add_column(column.title, justify="right", no_wrap=True)
@@ -48,7 +48,7 @@ def table_of(cells: Sequence[Cell], unit: Unit, text_order: Order, width: int) -
     room = max(_SPARE, width - 9 - sum(_WIDTHS.get(column.title, 13) + 1 for column in columns))
     for number, cell in enumerate(cells):
         row = [
-            _text(column, [one.raw for one in cells[number : number + column.words]], cell)
+            _styled(shown_in(column, cells, number), cell, column.title == "hex")
             for column in columns
         ]
         mark = "* " if cell.changed else ""
@@ -56,16 +56,20 @@ def table_of(cells: Sequence[Cell], unit: Unit, text_order: Order, width: int) -
     return table
 
 
-def _text(column: Column, raws: Sequence[int | None], cell: Cell) -> Text:
+def shown_in(column: Column, cells: Sequence[Cell], number: int) -> str:
+    """Returns the text of a cell in a column; `-` without all the words that it needs."""
+    raws = [cell.raw for cell in cells[number : number + column.words]]
     words = [raw for raw in raws if raw is not None]
-    if len(words) < column.words:
-        return Text("-", style="dim")
-    shown = column.show(words)
-    style = CHANGED if cell.changed and column.title == "hex" else ""
-    return Text(shown, style="dim" if shown.endswith("?") else style)
+    return column.show(words) if len(words) == column.words else "-"
 
 
-def _columns(unit: Unit, text_order: Order, width: int) -> list[Column]:
+def _styled(shown: str, cell: Cell, is_hex: bool) -> Text:
+    style = CHANGED if cell.changed and is_hex else ""
+    return Text(shown, style="dim" if shown == "-" or shown.endswith("?") else style)
+
+
+def columns_of(unit: Unit, text_order: Order, width: int) -> list[Column]:
+    """Returns the columns of words that `width` characters have room for."""
     if unit is Unit.DWORD:
         halves = _halves
         return [

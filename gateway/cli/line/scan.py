@@ -135,16 +135,26 @@ def _number(text: str, such_as: str = "1-31,40") -> int:
     return int(text)
 
 
-async def scan(plan: Plan, tell: Callable[[str], None] = lambda _: None) -> Report:
+async def scan(
+    plan: Plan,
+    tell: Callable[[str], None] = lambda _: None,
+    share: Callable[[str, float], None] = lambda _what, _share: None,
+) -> Report:
     """Sends a harmless request to every station, at one speed and format after the other.
 
-    Ends with the first speed and format at which a station replies: a line has only one. Raises
-    `LineDown` when the port cannot be opened, or is lost.
+    Ends with the first speed and format at which a station replies: a line has only one. `share`
+    receives the station that is asked, and the share of all that is done. Raises `LineDown` when
+    the port cannot be opened, or is lost.
     """
     report = Report()
-    for settings in plan.serial:
+    for number, settings in enumerate(plan.serial):
         tell(f"asking {len(plan.stations)} stations at {spoken(settings)}")
-        await _Scan(plan, settings, report).ask()
+
+        def step(asked: int, number: int = number, at: str = spoken(settings)) -> None:
+            done = (number + asked / len(plan.stations)) / len(plan.serial)
+            share(f"station {plan.stations[asked]} at {at}", done)
+
+        await _Scan(plan, settings, report, step).ask()
         if report.found:
             break
     return report
@@ -158,8 +168,15 @@ def spoken(settings: SerialSettings | None) -> str:
 class _Scan:
     """The port, opened once. The `Receiver` of the current transaction."""
 
-    def __init__(self, plan: Plan, serial: SerialSettings | None, report: Report) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        serial: SerialSettings | None,
+        report: Report,
+        step: Callable[[int], None],
+    ) -> None:
         self._plan = plan
+        self._step = step
         self._serial = serial
         self._report = report
         behind = serial or SerialSettings()  # there may be a slow wire behind a network
@@ -181,6 +198,7 @@ class _Scan:
         channel = Channel(port, self._wire, WireLog(), echo=Echo("scan", None))
         try:
             for probe_token, station in enumerate(self._plan.stations):
+                self._step(probe_token)
                 if (found := await self._seek(channel, station, probe_token)) is not None:
                     self._report.found.append(found)
         finally:

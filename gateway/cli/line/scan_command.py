@@ -10,6 +10,7 @@ import typer
 from gateway.cli.line import scan as scanning
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.scan import Found, Report, spoken
+from gateway.cli.progress import progress
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, AsJson, end, err
 
@@ -50,7 +51,8 @@ def scan(
 def scanned(plan: scanning.Plan, none_replied: str) -> Report:
     """Scans; ends the command with the sentence `none_replied` if no station replied."""
     set_up(LogFormat.TEXT, LogLevel.ERROR)
-    report = asyncio.run(scanning.scan(plan, err.print))
+    with progress(err) as share:
+        report = asyncio.run(scanning.scan(plan, err.print, share))
     for sentence in noises(report):
         err.print(sentence)
     if not report.found:

@@ -14,7 +14,7 @@ from gateway.config import Config, ConfigErrors, built, load
 from gateway.config.loading import dumped
 from gateway.config.messages import one_of
 from gateway.config.sheets import Grid, adapted, cells, devices_in, link_table, read_grid
-from gateway.config.sheets.tags import preview
+from gateway.config.sheets.tags import SheetUse, preview
 from gateway.config.yaml.insert import entry, with_tags
 from gateway.errors import ConfigError
 from gateway.tags import Tag
@@ -137,13 +137,28 @@ def add_tags(
     grid = grid or read_grid(read_file(sheet))
     devices = devices or _devices_of_table(sheet, grid, into) or _only_device(into)
     before = read_file(into)
-    text = before.removeprefix(BOM).decode()
     try:
-        wanted = load(into, imports={device: (sheet.absolute(), grid) for device in devices})
+        text, uses = with_sheet(into, before.removeprefix(BOM).decode(), sheet, grid, devices)
     except ConfigErrors as error:
         ending = "one mistake" if error.count == 1 else f"{error.count} mistakes"
         last = f"{ending}: nothing was written"
         raise ConfigErrors([*error.messages, last], error.count) from None
+    kept = replace(into, before, text, load, backup=backup, dry=dry_run)
+    for use in uses:
+        print_notes(sheet, use.notes)
+    added = f"tags of {sheet.name} added to"
+    return [*(f"{into.name}: {len(use.raw)} {added} {use.device}" for use in uses), *kept]
+
+
+def with_sheet(
+    into: Path, text: str, sheet: Path, grid: Grid, devices: Sequence[str]
+) -> tuple[str, list[SheetUse]]:
+    """Returns the text of the file with the tags of a sheet, and what they are.
+
+    Raises `ConfigErrors` with every mistake.
+    """
+    imports = {device: (sheet.absolute(), grid) for device in devices}
+    wanted = load(into, imports=imports, text=text)
     uses = [use for use in wanted.sheets if use.file == sheet.absolute()]
     missing = set(devices) - {use.device for use in uses}
     for use in uses:
@@ -151,23 +166,16 @@ def add_tags(
         text = with_tags(str(into), text, use.device, use.raw, comment)
     if missing:
         with_tags(str(into), text, missing.pop(), {}, "")  # raises: names the devices of the file
-
-    def check(new: Path) -> None:
-        try:
-            same = _meaning(load(new)) == _meaning(wanted)
-        except ConfigErrors:
-            same = False
-        if not same:
-            raise ConfigError(
-                f"the tags cannot be inserted into {into.name} as it is written: "
-                "write `tags_from: <sheet>` into the device instead"
-            )
-
-    kept = replace(into, before, text, check, backup=backup, dry=dry_run)
-    for use in uses:
-        print_notes(sheet, use.notes)
-    added = f"tags of {sheet.name} added to"
-    return [*(f"{into.name}: {len(use.raw)} {added} {use.device}" for use in uses), *kept]
+    try:
+        same = _meaning(load(into, text=text)) == _meaning(wanted)
+    except ConfigErrors:
+        same = False
+    if not same:
+        raise ConfigError(
+            f"the tags cannot be inserted into {into.name} as it is written: "
+            "write `tags_from: <sheet>` into the device instead"
+        )
+    return text, uses
 
 
 def print_notes(sheet: Path, notes: tuple[str, ...] | list[str]) -> None:

@@ -30,7 +30,7 @@ def replace(
     into: Path,
     before: bytes,
     after: str,
-    check: Callable[[Path], None],
+    check: Callable[[Path], object],
     *,
     backup: bool = True,
     dry: bool = False,

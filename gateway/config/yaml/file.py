@@ -176,15 +176,18 @@ class YamlFile:
 
 
 def read_yaml(
-    path: FilePath, texts: frozenset[str], report: Callable[[float], None] | None = None
+    path: FilePath,
+    texts: frozenset[str],
+    report: Callable[[float], None] | None = None,
+    text: str | None = None,
 ) -> tuple[YamlFile, Mistakes]:
     """Returns the file and the mistakes found so far.
 
     `texts` are the keys whose values are texts even where they look like numbers (`7E1`). `report`
-    receives the share that is read.
+    receives the share that is read. `text`: in place of that of the file.
     Raises `ConfigErrors` where the file cannot be read.
     """
-    file = YamlFile(str(path), file_text(path), texts)
+    file = YamlFile(str(path), file_text(path) if text is None else text, texts)
     mistakes = Mistakes(file)
     file.read(mistakes, report)
     return file, mistakes

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from textwrap import dedent, indent
 from typing import NamedTuple
 
 import yaml
@@ -42,6 +43,23 @@ def with_tags(name: str, text: str, device: str, tags: Mapping[str, Settings], c
     body = begin + (",\n" if spot.flow else "\n").join(rows)
     put = (spot.before + body + spot.after).replace("\n", newline)
     return text[: spot.start] + put + text[spot.end :]
+
+
+def with_block(name: str, text: str, path: Sequence[str], block: str) -> str:
+    """Returns the text of a configuration with more entries of the mapping at `path`.
+
+    `block`: the entries, as YAML. Raises as `with_tags`.
+    """
+    node: yaml.Node = compose(name, text)
+    for part in path:
+        node = next((value for key, value in _entries(node) if key.value == part), node)
+    entries = _entries(node)
+    if not entries or getattr(node, "flow_style", True):
+        raise ConfigError(f"{'.'.join(path)} in {name} is no block with entries: add them by hand")
+    newline = "\r\n" if "\r\n" in text else "\n"
+    end = _end_of(text, entries[-1][1])
+    put = indent(dedent(block).rstrip(), " " * entries[0][0].start_mark.column)
+    return f"{text[:end]}{newline}{put.replace(chr(10), newline)}{text[end:]}"
 
 
 def entry(name: str, raw: Settings) -> str:

@@ -7,8 +7,10 @@ in a header, never in an address: addresses are kept in logs and histories.
 
 import hmac
 import socket
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from ipaddress import ip_address
+from typing import Protocol
 from urllib.parse import urlsplit
 
 from aiohttp import web
@@ -42,14 +44,24 @@ _PREFLIGHT = {
 }
 
 
-class Guard:
-    """The middleware before every handler. Raises `ConfigError` for a bad tokens file."""
+class Tokens(Protocol):
+    def current(self) -> Mapping[str, bytes]:
+        """Returns the tokens by the name of their client."""
 
-    def __init__(self, config: WebSection, connections: Connections) -> None:
-        self._tokens = None
-        if config.tokens_file is not None:
+
+class Guard:
+    """The middleware before every handler. Raises `ConfigError` for a bad tokens file.
+
+    `tokens`: in place of those of the file; then reading needs one on this machine too.
+    """
+
+    def __init__(
+        self, config: WebSection, connections: Connections, tokens: Tokens | None = None
+    ) -> None:
+        self._tokens = tokens
+        if tokens is None and config.tokens_file is not None:
             self._tokens = NamedSecrets(config.tokens_file, "web.tokens_file")
-        self._reads_need_token = not config.is_local
+        self._reads_need_token = tokens is not None or not config.is_local
         self._origins = frozenset(config.origins)
         self._names = {"localhost", socket.gethostname().lower(), *config.names}
         self._connections = connections

@@ -1,0 +1,95 @@
+"""The `bench` command: a page on this machine from an unknown line to tags on Zenoh."""
+
+import asyncio
+import signal
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.cli.bench.api import BenchApi, Entry
+from gateway.cli.config.new import LISTEN
+from gateway.cli.line.logs import LogFormat, LogLevel, set_up
+from gateway.cli.line.simulate import stop_event
+from gateway.config.sheets.grid import MOST_BYTES
+from gateway.errors import ConfigError, GatewayError
+from gateway.parts.web.connections import Connections
+from gateway.parts.web.guard import Guard
+from gateway.parts.web.listener import Listener, files_of
+from gateway.parts.web.server import ASSETS
+from gateway.parts.web.settings import WebSection
+
+_FOLDER = Path(__file__).parent / "assets"
+_SHARED = {"/page.css", "/dom.js", "/icon.svg"}  # with the page of the gateway
+_HOST = "127.0.0.1"
+_ADDRESS = "Bench: http://127.0.0.1:{}/#{} (works once; Ctrl-C ends the bench)"
+
+
+def bench(
+    file: Annotated[
+        Path, typer.Argument(metavar="[FILE]", help="The YAML file; it is made if there is none.")
+    ] = Path("plant.yaml"),
+    at: Annotated[
+        int, typer.Option(min=0, max=65535, help="the port of the page (default: a free one)")
+    ] = 0,
+) -> None:
+    """Open a page on this machine: scan a line, look at registers, name tags, import, apply.
+
+    Only this machine reaches it, with an address that works once. It writes nothing but FILE.
+    """
+    if not file.resolve().parent.is_dir():
+        raise ConfigError(f"there is no folder {file.parent}")
+    set_up(LogFormat.TEXT, LogLevel.ERROR)
+    asyncio.run(_run(BenchApi(file, _free_endpoint()), at))
+
+
+async def _run(api: BenchApi, at: int) -> None:
+    stop = stop_event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, stop.set)  # its terminal has gone
+    serving = asyncio.create_task(serve(api, at, partial(print, flush=True)))
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait([serving, stopping], return_when=asyncio.FIRST_COMPLETED)
+    for task in (serving, stopping):
+        task.cancel()
+    await asyncio.gather(serving, stopping, return_exceptions=True)
+
+
+async def serve(api: BenchApi, at: int, tell: Callable[[str], None]) -> None:
+    """Serves the page until it is cancelled, and then ends all that the bench has started.
+
+    `tell` gets the address, and a new one whenever it was used.
+    """
+    port = asyncio.get_running_loop().create_future()
+    entry, connections = Entry(lambda key: tell(_ADDRESS.format(port.result(), key))), Connections()
+    config = WebSection().model_copy(update={"listen": (_HOST, at)})
+    shared = [one for one in files_of(ASSETS, "page.html") if one.path in _SHARED]
+    routes = [*api.routes(entry), *files_of(_FOLDER, "bench.html"), *shared]
+    listener = Listener(
+        config, Guard(config, connections, entry), connections, routes, most_body=MOST_BYTES
+    )
+    serving = asyncio.create_task(listener.run(port.set_result), name="bench")
+    try:
+        await asyncio.wait([port, serving], return_when=asyncio.FIRST_COMPLETED)
+        if api.draft.file is not None:
+            with suppress(GatewayError):
+                await api.running.look(api.draft.config())
+        entry.begin()
+        await serving
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        await api.close()
+
+
+def _free_endpoint() -> str:
+    """Returns the usual endpoint of Zenoh in a new file, or a free one if it is taken."""
+    usual = int(LISTEN.rpartition(":")[2])
+    for port in (usual, 0):
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind((_HOST, port))
+            return f"tcp/{_HOST}:{probe.getsockname()[1]}"
+    return LISTEN
