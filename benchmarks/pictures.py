@@ -217,6 +217,7 @@ async def look_at_bench(arguments: argparse.Namespace) -> None:
                     await page.click("#apply", f"{shown('#good')} === '20 of 20 values are good'")
                     await tab.value("document.querySelectorAll('.name')[24].value = 'recipe'")
                     await page.click("#add-tags", f"{shown('#size')} === '21 tags on 1 line'")
+                await tab.value("document.getElementById('main').scrollTo(0, 0)")
                 await tab.screenshot(arguments.into / f"bench-{size}-{scheme}.png")
         assert tab.errors == []
 

@@ -51,7 +51,8 @@ async function look() {
   state = await call("state");
   lost("");
   document.title = `Bench: ${state.file}`;
-  put("file", state.file);
+  put("file", state.file.split("/").at(-1));
+  byId("file").title = state.file;
   showGateway(state.gateway);
   showScan(state);
   showDraft(state);
