@@ -31,6 +31,7 @@ from gateway.parts.history.historian import Historian
 from gateway.service.service import THREAD_SWITCH
 from gateway.tags import Tag, good
 from tests.no_parts import NoParts
+from tests.northbound.plant import running
 from tests.zenoh_peer import free_endpoint
 
 ROOT = Path(__file__).parents[1]
@@ -78,10 +79,9 @@ async def serve(endpoint: str, path: Path, count: int) -> None:
         await asyncio.sleep(0.01)
     settings = ZenohConfig(listen=(endpoint,))
     northbound = Northbound(settings, "demo", plant, parts=Kept(historian))
-    serving = asyncio.create_task(northbound.run())
-    await northbound.opened.wait()
-    print("ready", flush=True)
-    await serving
+    async with running(northbound):
+        print("ready", flush=True)
+        await asyncio.Event().wait()
 
 
 def read(endpoint: str) -> None:

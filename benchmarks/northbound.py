@@ -47,7 +47,8 @@ from gateway.service.service import GC_THRESHOLDS, THREAD_SWITCH
 from gateway.tags import Sample, Tag, WriteResult, WriteRule, good
 from gateway.tags.mirror import Mirror
 from gateway.values import Layout, Value, parse_type
-from tests.no_parts import NoParts
+from tests.no_parts import STATUS, NoParts
+from tests.northbound.plant import running
 from tests.zenoh_peer import free_endpoint
 
 SCAN = 100  # samples of one publication
@@ -125,7 +126,7 @@ class Plant:
         return self.mirror[tag]
 
     def status(self) -> Mapping[str, Mapping[str, object]]:
-        return {"status": {"state": "running"}}
+        return {"status": STATUS}
 
 
 def plant(tags: int, devices: int, blocks: bool | Literal["only"] = False) -> Plant:
@@ -389,13 +390,11 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
     with_tags = memory()
     began = time.perf_counter()
     northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made, parts=NoParts())
-    serves = asyncio.create_task(northbound.run())
-    await northbound.opened.wait()
-    print(f"on Zenoh with {tags:,} tags on {devices} devices after "
-          f"{time.perf_counter() - began:.2f} s")  # fmt: skip
-    print(f"memory: {before:.0f} MB empty, {with_tags - before:.0f} MB more with the tags, "
-          f"{memory() - with_tags:.0f} MB more on Zenoh")  # fmt: skip
-    try:
+    async with running(northbound):
+        print(f"on Zenoh with {tags:,} tags on {devices} devices after "
+              f"{time.perf_counter() - began:.2f} s")  # fmt: skip
+        print(f"memory: {before:.0f} MB empty, {with_tags - before:.0f} MB more with the tags, "
+              f"{memory() - with_tags:.0f} MB more on Zenoh")  # fmt: skip
         for device in made.made:
             northbound.set_online(device.name, True)
         with other("count", endpoint) as process:
@@ -405,9 +404,6 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
         if for_flood:
             await flooded(made, northbound, ("ask", "ask", "ask"), endpoint, for_flood)
             await flooded(made, northbound, ("flood", "ask"), endpoint, for_flood)
-    finally:
-        serves.cancel()
-        await asyncio.wait([serves])
     return rate
 
 
@@ -415,9 +411,7 @@ async def gateway_of_blocks(tags: int, devices: int, seconds: float) -> Rate:
     """Each device has one scan in a round; the next round begins when all were put."""
     endpoint, made = free_endpoint(), plant(tags, devices, "only")
     northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made, parts=NoParts())
-    serves = asyncio.create_task(northbound.run())
-    await northbound.opened.wait()
-    try:
+    async with running(northbound):
         with other("count", endpoint) as process:
             counter = await asyncio.to_thread(Counter, process)
             await asyncio.sleep(1.0)
@@ -433,9 +427,6 @@ async def gateway_of_blocks(tags: int, devices: int, seconds: float) -> Rate:
             probe.cancel()
             rate = Rate(sent, took, used, await asyncio.to_thread(counter.until_quiet) - first)
             print(f"gateway, blocks: only: {rate}; {lag.shown()}")
-    finally:
-        serves.cancel()
-        await asyncio.wait([serves])
     return rate
 
 

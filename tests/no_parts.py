@@ -3,6 +3,20 @@
 from gateway.contract.interfaces import History, Keyed
 from gateway.errors import Busy
 
+# The document `status` of a gateway without lines.
+STATUS: dict[str, object] = {
+    "contract": 2,
+    "name": "demo",
+    "version": "1.0.0",
+    "time": "2026-11-24T12:00:00.000000Z",
+    "up": 1.0,
+    "tags": 3,
+    "simulated": [],
+    "replayed": [],
+    "lines": {},
+    "devices": {},
+}
+
 
 class NoParts:
     """A gateway without parts."""

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import scenario_clients, scenarios
 from tests.conftest import lacking, needs
-from tests.e2e.processes import ROOT
+from tests.e2e.processes import PATIENCE, ROOT
 
 # Program, its smallest sizes, and a pattern for each row of figures that it must print.
 TINY = [
@@ -128,7 +128,9 @@ PARTS_OF_OTHERS = {
 
 def printed(program: str, *arguments: str) -> str:
     command = [sys.executable, "-m", f"benchmarks.{program}", *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

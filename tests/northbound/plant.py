@@ -22,6 +22,7 @@ from gateway.plant.part import Core
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
+from tests.no_parts import STATUS
 from tests.tag_settings import grouped
 from tests.zenoh_peer import TIMEOUT, ZenohPeer, free_endpoint
 
@@ -160,7 +161,7 @@ class PlainPlant:
         return self.samples[tag.key]
 
     def status(self) -> Mapping[str, Mapping[str, object]]:
-        return {"status": {"state": "running"}, "lines/hall-1": {"load": 0.5}}
+        return {"status": STATUS, "loads/hall-1": {"load": 0.5}}
 
     def now(self, key: str, value: Value) -> Sample:
         """A new sample, already current."""

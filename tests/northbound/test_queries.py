@@ -3,6 +3,7 @@
 import asyncio
 
 from gateway.tags import Reason, Sample, Tag, bad
+from tests.no_parts import STATUS
 from tests.northbound.plant import (
     PlainDevice,
     PlainPlant,
@@ -78,14 +79,14 @@ async def test_status_is_answered_and_published() -> None:
         keys = {reply.key for reply in await client.get("plant/@gateway/*/**")}
         own = "plant/@gateway/demo"
         claim = next(key for key in keys if key is not None and "/claim/" in key)
-        documents = {f"{own}/{name}" for name in ("status", "lines/hall-1", "zenoh", "outcomes")}
-        assert keys == documents | {claim}
-        [reply] = await client.get(f"{own}/lines/*")
+        names = ("status", "loads/hall-1", "zenoh", "outcomes", "report")
+        assert keys == {f"{own}/{name}" for name in names} | {claim}
+        [reply] = await client.get(f"{own}/loads/*")
         assert reply.json == {"load": 0.5}
         received = await client.subscribe("plant/@gateway/*/status")
         status = (await received.next(lambda _: True)).json
         assert status == {
-            "state": "running",
+            **STATUS,
             "refused_devices": {},
             "refused_claims": [],
             "answered_elsewhere": None,
