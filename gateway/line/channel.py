@@ -78,12 +78,15 @@ class Echo:
         self._line = line
         self._setting = setting
         self._logged = False  # once for each line, not at every opening
+        self.found = setting
         self.strip = bool(setting)
         self.opened()
 
     def opened(self) -> None:
-        """Starts again: the port was opened, perhaps with another adapter."""
-        self.found = self._setting  # None: not yet known
+        """Starts again: the port was opened, perhaps with another adapter. That there was no echo
+        is known as before, but not proven: an acknowledgement that could be one needs a resync."""
+        if not self.absent_by_evidence:
+            self.found = self._setting  # None: not yet known
         self.absent_at = -NEVER  # when a reply came without an echo last
         self._pending = b""  # the part of the echo that must still arrive
         self._early = b""  # bytes that arrived before the echo

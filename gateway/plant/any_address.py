@@ -45,16 +45,18 @@ class AnyAddress:
     async def read(self, device: str, span: Span, within: float) -> list[int]:
         """Returns the units. After `within` seconds no request is sent any more."""
         line, receiver = self.place(device)
-        numbers, units = range(span.start, span.start + span.size), list[int]()
-        try:
-            parts = list(spans(receiver.driver, span.area, numbers))
-        except ConfigError as error:
-            raise BadValue(str(error)) from None
-        for part in parts:
+        units = list[int]()
+        for part in _parts(receiver, span):
             if self._places.get(device) != (line, receiver):
                 raise Busy(f"the file was reloaded, and {device} with it; read it again")
             units += map(int, (await line.peek(receiver, part, within)).split())
         return units
+
+    def seconds(self, device: str, span: Span) -> float:
+        """Returns the wire time of `read`."""
+        _, receiver = self.place(device)
+        costs = map(receiver.driver.cost, _parts(receiver, span))
+        return sum(receiver.seconds(cost) for cost in costs if cost is not None)
 
     def known(self, device: str, span: Span, max_age: float) -> list[int] | None:
         """Returns the units if a poll has read all of them together in the last `max_age` seconds,
@@ -105,6 +107,14 @@ class AnyAddress:
         for tag in receiver.settings.wire_tags:
             if any(tag.span.overlaps(span) for span in spans_written):
                 line.expedite(receiver, tag)
+
+
+def _parts(device: Device, span: Span) -> list[Span]:
+    """Returns the spans of the requests that read `span`."""
+    try:
+        return [*spans(device.driver, span.area, range(span.start, span.start + span.size))]
+    except ConfigError as error:
+        raise BadValue(str(error)) from None
 
 
 def _tag(device: str, driver: AnyDriver, span: Span) -> Tag:

@@ -103,6 +103,7 @@ async def polled(
     numbers: Iterable[int] | Mapping[int, Any],
     *,
     echo: bool | None = None,
+    close_after: str | None = None,
     **settings: Any,
 ) -> AsyncIterator[tuple[Line, Watch]]:
     """Runs a line that polls these registers of the slave. `numbers`: also with settings."""
@@ -120,6 +121,7 @@ async def polled(
     }
     line = {"port": f"tcp://127.0.0.1:{port}", "baudrate": 115200, "devices": {"slave": device}}
     line |= {} if echo is None else {"echo": echo}
+    line |= {} if close_after is None else {"close_after": close_after}
     file = write_config(folder / "config.yaml", "tcp/127.0.0.1:0", {"hall": line})
     [config] = load(file).lines
     watch = Watch()

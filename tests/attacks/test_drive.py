@@ -13,7 +13,7 @@ import pytest
 
 from gateway.engine.device.health import State
 from gateway.engine.results.request_rules import Differs
-from gateway.errors import GatewayError, Offline, Refused
+from gateway.errors import GatewayError, Offline, Refused, Unclear
 from gateway.line.line import Line
 from gateway.tags import WriteResult
 from tests.attacks.slave import Slave, Watch, crc, polled
@@ -26,9 +26,14 @@ class Drive(Slave):
     """Writes above `MOST` are limited. `refuses`: the exception to every write."""
 
     refuses: int | None = None
+    echoes: bool = False  # from the next write on it is off, and the adapter returns what is sent
+    _off: bool = False
     held: dict[int, int] = field(default_factory=dict)
 
     def _reply(self, request: bytes) -> bytes:
+        self._off = self.echoes and (self._off or request[1] == 6)
+        if self._off:
+            return request
         if request[1] != 6:
             return super()._reply(request)
         if self.refuses is not None:
@@ -128,3 +133,18 @@ async def test_the_code_of_a_device_that_refuses_everything_is_the_answer(
             assert outcome.code == f"{code:02X}"
         with suppress(IndexError):
             assert "two" not in line.engine.devices[0].diagnosis()
+
+
+@pytest.mark.parametrize("echoes", [False, True])
+async def test_a_write_that_begins_a_connection_is_acknowledged_unless_it_is_an_echo(
+    echoes: bool, tmp_path: Path
+) -> None:
+    """With `close_after: round` each write of one register was unclear, although it was done."""
+    drive = Drive(lambda n: n in (10, 11))
+    tags: dict[int, dict[str, Any]] = {10: {"every": "10s"}, 11: {"every": "10s", "write": True}}
+    async with running(drive, tmp_path, tags, close_after="round") as (line, watch):
+        await watch.until(lambda: watch.good == {10, 11})
+        assert isinstance(await written(line, 11, 11), WriteResult)
+        drive.echoes = echoes
+        outcome = await written(line, 11, 11)
+        assert isinstance(outcome, Unclear if echoes else WriteResult)

@@ -340,6 +340,18 @@ async def test_programs_get_their_share_and_no_more() -> None:
 
 
 @on_virtual_time
+async def test_a_read_that_needs_several_requests_costs_them_all() -> None:
+    """It was free: programs took two thirds of the wire with `most: 5%`."""
+    press = {**PRESS, "max_read_words": 10}
+    lines = {"hall": {**LINES["hall"], "devices": {"press": press}}}
+    async with opened(door("hall", "modbus-tcp", most="5%", reply_within="10s"), lines) as hall:
+        program = Program(hall.door)
+        assert len(await program.ask(tcp("03 0064 007d"))) == 7 + 2 + 250
+        assert 0.003 < hall.door.document(now())["share"] < 0.02  # 13 requests in a minute
+        assert await program.ask(tcp("03 0064 007d")) == b""  # its time is used up for a while
+
+
+@on_virtual_time
 async def test_a_program_that_pours_is_disconnected() -> None:
     async with opened(door("hall", "modbus-tcp")) as hall:
         program = Program(hall.door)

@@ -81,9 +81,7 @@ class GuestRequests:
     async def _read(self, step: Step, door: Door, _by: str, within: float) -> Outcome:
         found = dict[Cell, int]()
         for run in step.runs():
-            _, device = self._any.place(step.device)
-            cost = device.driver.cost(run)
-            self._spend(0.0 if cost is None else device.seconds(cost), door.most)
+            self._spend(self._any.seconds(step.device, run), door.most)
             units = await self._any.read(step.device, run, within)
             found |= {(run.area, run.start + ahead): unit for ahead, unit in enumerate(units)}
         return found
