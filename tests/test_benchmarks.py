@@ -15,6 +15,11 @@ from tests.e2e.processes import PATIENCE, ROOT
 # Program, its smallest sizes, and a pattern for each row of figures that it must print.
 TINY = [
     (
+        "bridge_opcua",
+        "--tags 20 --rates 40 --seconds 0.5",
+        [r"^20 tags: known after [\d.]+ s, all watched", r"^[\d,]+ changes/s offered: .* 0 lost"],
+    ),
+    (
         "bus_use",
         "--seconds 0.3 --protocols vigor --bauds 115200",
         [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],

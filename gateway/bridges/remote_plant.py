@@ -189,10 +189,19 @@ class RemotePlant:
         is_waiting = before["quality"] != "bad" or before["reason"] == "starting"
         return before if is_waiting else bad("starting")
 
-    async def write(self, key: str, value: object, time: str | None = None) -> Known:
+    def distrust(self) -> None:
+        """After a pause of this process: no value is good until it was queried again."""
+        self._presence.trusted.clear()
+        for key in list(self.values):
+            self._store(key, bad("no-gateway"))
+        self._query_due.set()
+
+    async def write(
+        self, key: str, value: object, time: str | None = None, writer: str | None = None
+    ) -> Known:
         """Writes once, as `Requests.write`."""
         if key in self.tags:
-            return await self.requests.write(key, value, time)
+            return await self.requests.write(key, value, time, writer)
         return {"outcome": "no-gateway", "reason": "no gateway has described this tag"}
 
     async def past(self, key: str, bounds: str) -> AsyncIterator[list[Known]]:

@@ -48,23 +48,32 @@ class Requests:
         await ended.wait()
         return replies
 
-    async def write(self, key: str, value: object, time: str | None = None) -> Known:
+    async def write(
+        self, key: str, value: object, time: str | None = None, writer: str | None = None
+    ) -> Known:
         """Writes once. Returns `outcome`: `written`, or an error of docs/zenoh.md with `reason`.
 
-        `time`: when the write was ordered; the gateway refuses it five seconds later.
+        `time`: when the write was ordered; the gateway refuses it five seconds later. `writer`:
+        `name:secret` of the one who writes, where the environment names none.
         """
         if all(reply.ok is None for reply in await self.ask(f"{key}/@meta")):
             why = "no gateway serves this tag now: nothing was sent"
             return {"outcome": "no-gateway", "reason": why}
         payload = json.dumps(value).encode()  # not orjson: a float tag accepts any integer
+        return {"outcome": "written"} | await self.order(f"{key}/@set", payload, time, writer)
+
+    async def order(
+        self, key: str, payload: bytes, time: str | None = None, writer: str | None = None
+    ) -> Known:
+        """Sends a query with a payload once. Returns the answer, or `outcome` as `write`."""
         attachment = orjson.dumps({"time": time}) if time else None
-        if writer := os.environ.get(self.WRITER):
+        if writer := os.environ.get(self.WRITER) or writer:
             name, _, secret = writer.partition(":")
-            whole_key = f"{self._prefix}/{key}/@set"
+            whole_key = f"{self._prefix}/{key}"
             attachment = sign(name, secret, time or utc_now(), whole_key, payload)
-        for reply in await self.ask(f"{key}/@set", payload=payload, attachment=attachment):
+        for reply in await self.ask(key, payload=payload, attachment=attachment):
             if reply.ok is not None:
-                return {"outcome": "written", **orjson.loads(reply.ok.payload.to_bytes())}
+                return dict(orjson.loads(reply.ok.payload.to_bytes()))
             failed = reply.err
             if failed and failed.encoding == zenoh.Encoding.APPLICATION_JSON:  # else Zenoh's own
                 known = orjson.loads(failed.payload.to_bytes())

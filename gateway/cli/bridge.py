@@ -34,12 +34,36 @@ def opcua(
     listen: Annotated[str, typer.Option(help="Address of the server.")] = (
         "opc.tcp://127.0.0.1:4840"
     ),
-    writes: Writes = False,
+    users: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A line `name:token` for each user.")
+    ] = None,
+    anonymous: Annotated[
+        bool, typer.Option("--anonymous", help="Let clients read without a user.")
+    ] = False,
+    writer: Annotated[
+        list[str], typer.Option(metavar="NAME", help="A user that may write; several times.")
+    ] = [],  # noqa: B006
+    writes: Annotated[bool, typer.Option("--writes", help="Every user may write.")] = False,
+    security: Annotated[
+        list[str],
+        typer.Option(help="sign, encrypt or none; several times."),
+    ] = ["sign", "encrypt"],  # noqa: B006
+    pki: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Certificates: own, trusted, rejected.")
+    ] = Path("opcua-pki"),
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of the server (default: made in FOLDER).")
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The private key of the certificate.")
+    ] = None,
 ) -> None:
-    """Serve the values to OPC UA clients, with writes and history."""
+    """Serve values, alarms and history to OPC UA clients, and take writes from them."""
     with extra("opcua"):
-        from gateway.bridges.opcua.bridge import bridge
-    run(bridge(Gateways(connect, zenoh, prefix), listen, writes))
+        from gateway.bridges.opcua.server import Options, bridge
+    writers = None if writes else frozenset(writer)
+    options = Options(listen, pki, certificate, key, security, users, writers, anonymous)
+    run(bridge(Gateways(connect, zenoh, prefix), options))
 
 
 @cli.command()

@@ -34,7 +34,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "trace": ("plant.yaml hall-1", "plant.yaml hall-1 --for 30s --record recording"),
     "replay": ("recording", "recording --config plant.yaml --check"),
     "backup": ("plant.yaml copy.db",),
-    "bridge opcua": ("", "--connect tcp/10.0.0.5:7447 --listen opc.tcp://0.0.0.0:4840 --writes"),
+    "bridge opcua": (
+        "--users users.txt --writer ana",
+        "--connect tcp/10.0.0.5:7447 --listen opc.tcp://0.0.0.0:4840 --users users.txt --writes",
+    ),
     "bridge mqtt": ("--broker mqtt://127.0.0.1:1883", "--broker mqtts://ana@broker --writes"),
     "bridge influx": ("", "--to 'http://127.0.0.1:8086/api/v2/write?org=o&bucket=plant'"),
     "schema": ("", "--contract"),

@@ -1,4 +1,4 @@
-"""The status codes of `bridge opcua` are complete, and those of docs/integrate.md."""
+"""The status codes of `bridge opcua` are complete, and those of docs/opcua.md."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from gateway.tags import Reason
 from tests.e2e.processes import ROOT
 
 OPCUA = ROOT / "gateway" / "bridges" / "opcua"
-PAGE = (ROOT / "docs" / "integrate.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "opcua.md").read_text("utf-8")
 NOT_OF_WRITES = {Problem.BAD_QUERY, Problem.DAMAGED, Problem.NO_HISTORY}
 NOT_OF_WRITES |= {Problem.NOTHING_TO_ACKNOWLEDGE}
 NOT_OF_WRITES |= {Problem.NOT_SENT, Problem.INCOMPLETE}  # of several tags at once

@@ -1,7 +1,9 @@
-// npm's OPC UA client, controlled by commands: `node opcua_client.js FOLDER`, for its certificates. It
-// executes commands from its standard input and prints `ok` and JSON after each:
+// npm's OPC UA client, controlled by commands: `node opcua_client.js FOLDER`, which has its
+// certificate.pem and key.pem. It executes commands from its standard input and prints `ok` and JSON
+// after each:
 //
-//     connect opc.tcp://127.0.0.1:4840       the first command
+//     connect opc.tcp://127.0.0.1:4840 [MODE [USER TOKEN]]   the first command. MODE: None, Sign or
+//                                            SignAndEncrypt (Basic256Sha256)
 //     browse i=85                 the nodes below: their ids
 //     read ns=2;s=mixer/speed     value, type, status, source time
 //     meta ns=2;s=mixer/speed     data type, access level, description, unit and range
@@ -9,6 +11,8 @@
 //     start …  /  written         the same write in the background; waits for its status code
 //     history ns=2;s=mixer/speed SECONDS COUNT [back|last]   of the last seconds; `back`: the newest
 //                                            first; `last`: the newest first, without a start
+//     alarms                      prints `alarm NAME ACTIVE ACKED SEVERITY QUALITY` from now on
+//     acknowledge ns=2;s=mixer/level@alarm   its last event: the status code
 //     watch ns=2;s=mixer/speed    prints `changed ns=2;s=mixer/speed STATUS VALUE` from now on
 "use strict";
 
@@ -109,11 +113,58 @@ async function watch(session, nodeId) {
     });
 }
 
-async function main(folder) {
-    const client = ua.OPCUAClient.create({
-        clientCertificateManager: new OPCUACertificateManager({ rootFolder: folder }),
-        endpointMustExist: false,
+const FIELDS = [
+    "EventId", "ConditionName", "ActiveState.Id", "AckedState.Id", "Severity", "Quality", "EventType",
+];
+const events = {};
+
+async function alarms(session) {
+    const subscription = await session.createSubscription2({
+        requestedPublishingInterval: 50,
+        requestedLifetimeCount: 1000,
+        requestedMaxKeepAliveCount: 100,
+        publishingEnabled: true,
     });
+    const filter = ua.constructEventFilter(FIELDS, ua.ofType("AcknowledgeableConditionType"));
+    const item = await subscription.monitor(
+        { nodeId: "i=2253", attributeId: ua.AttributeIds.EventNotifier },
+        { samplingInterval: 0, queueSize: 100, filter },
+        ua.TimestampsToReturn.Both
+    );
+    item.on("changed", ([id, name, active, acked, severity, quality]) => {
+        events[name.value] = id.value;
+        const code = quality.value.name;
+        console.log("alarm", name.value, active.value, acked.value, severity.value, code);
+    });
+    await session.call({
+        objectId: "i=2782",
+        methodId: "i=3875",
+        inputArguments: [{ dataType: "UInt32", value: subscription.subscriptionId }],
+    });
+}
+
+async function acknowledge(session, nodeId) {
+    const name = nodeId.replace("ns=2;s=", "").replace("@alarm", "");
+    const code = await session.acknowledgeCondition(nodeId, events[name], "seen");
+    return code.name;
+}
+
+async function main(folder) {
+    const create = (securityMode) =>
+        ua.OPCUAClient.create({
+            clientCertificateManager: new OPCUACertificateManager({
+                rootFolder: folder,
+                automaticallyAcceptUnknownCertificate: true,
+            }),
+            certificateFile: `${folder}/certificate.pem`,
+            privateKeyFile: `${folder}/key.pem`,
+            applicationUri: "urn:tests:node",
+            endpointMustExist: false,
+            securityMode: ua.MessageSecurityMode[securityMode],
+            securityPolicy: ua.SecurityPolicy[securityMode === "None" ? "None" : "Basic256Sha256"],
+            connectionStrategy: { maxRetry: 0 },
+        });
+    let client;
     let session;
     let started;
     const commands = {
@@ -122,9 +173,19 @@ async function main(folder) {
         write,
         history,
         watch,
-        connect: async (_, endpointUrl) => {
-            await client.connect(endpointUrl);
-            session = await client.createSession();
+        alarms,
+        acknowledge,
+        connect: async (_, endpointUrl, mode = "None", userName = null, password = null) => {
+            client = create(mode);
+            try {
+                await client.connect(endpointUrl);
+                const identity = userName ? { type: ua.UserTokenType.UserName, userName, password } : {};
+                session = await client.createSession(identity);
+            } catch (error) {
+                await client.disconnect();
+                return error.message;
+            }
+            return null;
         },
         read: async (_, nodeId) => shown(await session.read({ nodeId })),
         start: async (...given) => {

@@ -1,1 +1,1 @@
-"""The OPC UA server with the values of the gateways."""
+"""Serves the gateways to OPC UA clients."""

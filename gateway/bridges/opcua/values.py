@@ -1,17 +1,12 @@
-"""Values and history of the gateways as OPC UA has them."""
+"""Values of the gateways as OPC UA has them."""
 
-import json
 import struct
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 
-import zenoh
 from asyncua import ua
-from asyncua.server.history import HistoryManager
-from asyncua.server.internal_server import InternalServer
 from asyncua.ua.ua_binary import variant_to_binary
 
-from gateway.bridges.documents import Known, copied
-from gateway.bridges.remote_plant import RemotePlant
+from gateway.bridges.documents import Known
 from gateway.contract.documents.catalogue import REASONS
 
 Code, Type = ua.StatusCodes, ua.VariantType
@@ -40,8 +35,6 @@ TYPES = {  # by the type of a tag; the others are texts
     "bcd16": Type.UInt16,
     "bcd32": Type.UInt32,
 }
-STEP = timedelta(microseconds=1)
-MOST_SAMPLES = 10_000  # in one answer; the client gets the rest with the continuation point
 
 
 def type_of(meta: Known) -> ua.VariantType:
@@ -83,97 +76,3 @@ def variant_of(value: object, kind: ua.VariantType) -> ua.Variant | None:
     except (ua.UaError, struct.error, OverflowError):
         return None
     return variant
-
-
-def _text(time: datetime | None) -> str:
-    return "" if time is None else f"{time:%Y-%m-%dT%H:%M:%S.%fZ}"
-
-
-class History(HistoryManager):
-    """Answers HistoryRead of raw values from the history of the gateway."""
-
-    def __init__(self, iserver: InternalServer, plant: RemotePlant) -> None:
-        super().__init__(iserver)
-        self._plant = plant
-
-    async def read_history(self, params: ua.HistoryReadParameters) -> list[ua.HistoryReadResult]:
-        results = []
-        for item in params.NodesToRead:
-            result = ua.HistoryReadResult(HistoryData=ua.HistoryData())
-            try:
-                values, rest = await self._history(params.HistoryReadDetails, item)
-                result.HistoryData.DataValues, result.ContinuationPoint = values, rest
-            except ua.UaStatusCodeError as error:
-                result.StatusCode = ua.StatusCode(error.code)
-            results.append(result)
-        return results
-
-    async def _history(
-        self, details: object, item: ua.HistoryReadValueId
-    ) -> tuple[list[ua.DataValue], bytes | None]:
-        """Returns samples and a continuation point: the time of the next one."""
-        key = item.NodeId.Identifier
-        if not isinstance(details, ua.ReadRawModifiedDetails) or details.IsReadModified:
-            raise ua.uaerrors.BadHistoryOperationUnsupported
-        if not self._plant.tags.get(key, {}).get("history"):
-            raise ua.uaerrors.BadHistoryOperationUnsupported
-        start, end = (
-            None if time is None or time <= ua.get_win_epoch() else time.astimezone(UTC)
-            for time in (details.StartTime, details.EndTime)
-        )
-        backwards = start is None or (end is not None and end < start)
-        if start is None:  # the last ones before a time
-            start, end = end, None
-        if item.ContinuationPoint:
-            try:
-                start = datetime.fromisoformat(item.ContinuationPoint.decode())
-            except ValueError:
-                raise ua.uaerrors.BadContinuationPointInvalid from None
-        if start is None:
-            raise ua.uaerrors.BadInvalidTimestampArgument
-        wanted = min(details.NumValuesPerNode or MOST_SAMPLES, MOST_SAMPLES)
-        # The bound where it starts is included. The gateway keeps nanoseconds, and shows less.
-        if backwards:
-            until = f"{_text(start + STEP)}["
-            begin = await self._oldest_of_last(key, f"]{_text(end)}..{until}", wanted + 1)
-            samples = await self._samples(key, f"{begin or f']{_text(end)}'}..{until}", None)
-        else:
-            samples = await self._samples(key, f"[{_text(start)}..{_text(end)}[", wanted + 1)
-        samples.sort(key=lambda known: known["time"], reverse=backwards)
-        rest = samples[wanted]["time"].encode() if len(samples) > wanted else None
-        kind = type_of(self._plant.tags[key])
-        return [data_value(known, kind) for known in samples[:wanted]], rest
-
-    async def _oldest_of_last(self, key: str, bounds: str, count: int) -> str:
-        """Returns the bound at the oldest of the last samples: the first reply, also of a broken
-        answer."""
-        for reply in await self._plant.requests.ask(f"{key}?_time={bounds};last={count}"):
-            if reply.ok and (known := self._plant.read(key, *copied(reply.ok)[1:])):
-                return f"[{known['time']}"
-        return ""
-
-    async def _samples(self, key: str, bounds: str, wanted: int | None) -> list[Known]:
-        """Queries page by page: only the end of a page tells whether all of it has arrived."""
-        samples: list[Known] = []
-        after = ""
-        while wanted is None or len(samples) < wanted:
-            replies = await self._plant.requests.ask(
-                f"{key}?_time={bounds};page={wanted or MOST_SAMPLES}{after}",
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-            )
-            if not replies:
-                raise ua.uaerrors.BadNoCommunication
-            *found, last = [reply.ok for reply in replies]
-            if last is None or not str(last.key_expr).endswith("/page"):
-                raise ua.uaerrors.BadCommunicationError
-            page = json.loads(last.payload.to_bytes())
-            if page["samples"] != len(found) or None in found:
-                raise ua.uaerrors.BadCommunicationError
-            if "damaged" in page:
-                raise ua.uaerrors.BadDataLost
-            read = [self._plant.read(key, *copied(sample)[1:]) for sample in found if sample]
-            samples += [known for known in read if known]
-            if page["complete"]:
-                break
-            after = f";after={page['next']}"
-        return samples
