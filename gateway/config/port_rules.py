@@ -22,6 +22,7 @@ from gateway.transport.port import (
 from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
 LONGEST_CONNECT_DELAY = 10.0  # seconds
+SHOWS_ONE = "the side that listens shows a certificate: write certificate and key"
 LONGEST_KEEPALIVE = 3600.0  # seconds
 MOST_ADDRESSES = 3  # of a device server, besides the port
 
@@ -105,7 +106,7 @@ def check_tls(
     if not secured and not isinstance(port, ListenAddress):
         mistakes.add(place, "certificates are for a port tls:// or listen://: this one has no TLS")
     if listens and own.certificate is None:
-        mistakes.add(place, "the side that listens shows a certificate: write certificate and key")
+        mistakes.add(place, SHOWS_ONE)
     if not listens and own.ca is None:
         mistakes.add(place, "write the authority that signs the certificate there, as `ca`")
     if own.writers and not (masters and own.mutual):

@@ -1,6 +1,7 @@
 """Modbus/TCP Security beside pymodbus: its servers are asked, and its client asks, over TLS."""
 
 import asyncio
+import json
 import ssl
 from pathlib import Path
 from typing import Any, cast
@@ -18,9 +19,10 @@ from gateway.contract.access.certificates import role
 from gateway.errors import ConfigError
 from gateway.parts.serving.served_line import ServedLine
 from gateway.tags import Quality, good
+from tests.e2e.processes import plc_gateway, started, write_config
 from tests.interop.test_served_lines import ACCEPT, TAGS, Plant
 from tests.transport.authority import Authority
-from tests.zenoh_peer import free_port
+from tests.zenoh_peer import free_endpoint, free_port
 
 
 class SecureClient(AsyncModbusTcpClient):
@@ -83,10 +85,7 @@ async def test_the_role_in_the_certificate_of_a_master_says_if_it_may_write(
     while not line.is_open:
         await asyncio.sleep(0)
     for found, answers in (("Operator", None), ("Viewer", 1), (None, 1)):
-        certificate, key = plant.issue("scada", role=found)
-        context = ssl.create_default_context(cafile=plant.ca)
-        context.load_cert_chain(certificate, key)
-        client = SecureClient(number, context)
+        client = SecureClient(number, shown(plant, found))
         assert await client.connect()
         read = await client.read_holding_registers(10, count=2, device_id=1)
         assert read.registers == [70000 & 0xFFFF, 1]
@@ -96,6 +95,50 @@ async def test_the_role_in_the_certificate_of_a_master_says_if_it_may_write(
     assert written.written("order") == [300]
     task.cancel()
     await asyncio.wait([task])
+
+
+async def test_the_role_of_a_program_says_if_it_may_write_at_a_door(tmp_path: Path) -> None:
+    """The gateway is the real program; a raw door takes no program without a role."""
+    plant, port, raw = Authority(tmp_path), free_port(), free_port()
+    press = {"protocol": "modbus-rtu", "station": 1, "tags": {"t": {"address": "holding:10"}}}
+    tls = tls_of(plant, "gateway", mutual=True, writers=["Operator"])
+    doors: dict[str, dict[str, Any]] = {
+        name: {"line": "hall", "listen": f"127.0.0.1:{number}", "protocol": name, "tls": tls}
+        for name, number in (("modbus-tcp", port), ("raw", raw))
+    }
+    doors["modbus-tcp"]["writes"] = {"press": ["holding:100..holding:110"]}
+    file = write_config(
+        tmp_path / "hall.yaml",
+        free_endpoint(),
+        {"hall": {"port": "simulator", "devices": {"press": press}}},
+        share={"doors": doors},
+    )
+    with started(file) as gateway:
+        gateway.says("door open", "modbus-tcp")
+        gateway.says("device online", "press")
+        contexts = [shown(plant, role) for role in ("Operator", "Viewer", None)]
+        for context, answers in zip(contexts, (None, 2, 2), strict=True):
+            client = SecureClient(port, context)
+            assert await client.connect()
+            assert not (await client.read_holding_registers(10, count=2, device_id=1)).isError()
+            wrote = await client.write_register(100, 300, device_id=1)
+            assert (wrote.exception_code if wrote.isError() else None) == answers
+            client.close()
+        reader, writer = await asyncio.open_connection("127.0.0.1", raw, ssl=contexts[1])
+        assert await reader.read() == b""
+        writer.close()
+        done = await asyncio.to_thread(plc_gateway, "status", file, "--json")
+        assert json.loads(done.out)["doors/raw"]["turned_away"] == 1
+        assert "certificates/share.doors.raw.tls.certificate" in json.loads(done.out)
+        assert gateway.end() == 0
+
+
+def shown(plant: Authority, role: str | None) -> ssl.SSLContext:
+    """Returns the context of a program with a certificate of this role."""
+    certificate, key = plant.issue("scada", role=role)
+    context = ssl.create_default_context(cafile=plant.ca)
+    context.load_cert_chain(certificate, key)
+    return context
 
 
 def test_one_address_is_one_line_whatever_its_scheme(tmp_path: Path) -> None:

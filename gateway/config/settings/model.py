@@ -121,7 +121,7 @@ class LineTlsSection(TlsSection):
     name: Text = ""
     """The name in the certificate of the other side; left out: the host of the port."""
     writers: list[Text] = []
-    """With serve: the roles of masters that may write; left out: all masters."""
+    """With serve, and at a door: the roles that may write; left out: all."""
 
     def record(self) -> TlsConfig:
         return TlsConfig(**dict(self) | {"writers": tuple(self.writers)})

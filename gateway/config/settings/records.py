@@ -4,7 +4,7 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from gateway.config.settings.zenoh_records import ZenohConfig
 from gateway.config.sheets.tags import SheetUse
@@ -53,6 +53,14 @@ class LineConfig:
         return tuple(tag for device in self.devices for tag in device.tags)
 
 
+@runtime_checkable
+class Secured(Protocol):
+    """Settings of a part with ports of TLS."""
+
+    def secured(self) -> Mapping[str, TlsConfig | None]:
+        """Returns the certificates, by setting."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """One whole file."""
@@ -85,11 +93,14 @@ class Config:
 
     @property
     def secured(self) -> Mapping[str, TlsConfig]:
-        """The certificates of Zenoh and of the lines, by setting."""
+        """The certificates of Zenoh, of the lines and of parts, by setting."""
         ports = {f"lines.{line.name}.tls": line.port for line in self.lines}
         kinds = (TcpAddress, ListenAddress)
         found = {name: one.tls for name, one in ports.items() if isinstance(one, kinds)}
         found = {"zenoh.tls": self.zenoh.tls, **found}
+        for one in self.parts.values():
+            if isinstance(one, Secured):
+                found |= one.secured()
         return {name: tls for name, tls in found.items() if tls is not None}
 
     @property

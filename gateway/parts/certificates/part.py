@@ -1,4 +1,4 @@
-"""Watches the certificates of Zenoh and of lines: an expired one ends their connections."""
+"""Watches the certificates of Zenoh, lines and doors: an expired one ends their connections."""
 
 import asyncio
 import hashlib
@@ -32,9 +32,11 @@ class Looked:
 
 
 class CertificatePart:
-    """The files of `zenoh.tls` and of the lines. Zenoh reads them when its session opens: with
-    renewed files the gateway starts over, when they are sound. Lines read theirs again by
-    themselves."""
+    """The files of `zenoh.tls`, of lines and of doors.
+
+    Zenoh reads them when its session opens: with renewed files the gateway starts over, when they
+    are sound. Lines and doors read theirs again by themselves.
+    """
 
     def __init__(self, core: Core) -> None:
         self._core = core

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
 from gateway.line.line import Line
-from gateway.parts.doors.guest_requests import NOT_NOW, Unanswered
+from gateway.parts.doors.guest_requests import NOT_NOW, Outcome, Unanswered
 from gateway.parts.doors.stores import Needs, Outcomes, Step
 from gateway.stations.served.answering import Heard
+from gateway.stations.store import Denied, Why
 from gateway.transport import Port
 
 if TYPE_CHECKING:
@@ -42,12 +43,13 @@ class Guest:
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._arrived = asyncio.Event()
         self._port: Port | None = None
+        self._may_write = False
         self._work: asyncio.Task[None] | None = None
 
     # The receiver of the connection
 
     def opened(self, port: Port) -> None:
-        self._port = port
+        self._port, self._may_write = port, self._door.may_write(port)
         self._work = self._door.start(self._serve())
         self._door.guests.add(self)
 
@@ -105,7 +107,10 @@ class Guest:
             for run in step.runs() if not step.writes else ():
                 door.reads.note(step.device, run, loop.time())
             left = at + door.settings.reply_within - loop.time()
-            if left > 0:
+            outcome: Outcome
+            if step.writes and not self._may_write:
+                outcome = Denied(Why.NOT_ACCEPTED)
+            elif left > 0:
                 by = f"door {door.settings.name}, {self._address}"
                 work = door.turns.carry_out(step, door.settings, by, left)
                 outcome = await asyncio.shield(door.start(work))

@@ -26,6 +26,7 @@ from gateway.stations.served.echo import Echo
 from gateway.stations.served.registry import answerer, is_numbered
 from gateway.stations.store import Store
 from gateway.tags.timestamps import rfc3339
+from gateway.transport import Port
 from gateway.transport.listen import Listener
 from gateway.transport.port import SerialSettings, TcpAddress, allows
 from gateway.transport.terminal import Terminal
@@ -104,10 +105,14 @@ class OpenDoor:
         raw, networks, line = self.settings.protocol in ALONE, self.settings.networks, self.line
         held = raw and (self.guests or asyncio.get_running_loop().time() < self._held_until)
         if held or line is None or (networks and not allows(networks, address)):
-            self._turned_away += 1
-            log.debug("turned away", door=self.settings.name, address=address)
+            self.turn_away(address)
             return None
         return Tunnel(self, line, address) if raw else Guest(self, line, address)
+
+    def turn_away(self, address: str) -> None:
+        """Counts a program that is not served."""
+        self._turned_away += 1
+        log.debug("turned away", door=self.settings.name, address=address)
 
     def start(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         return self._tasks.create_task(work)
@@ -115,6 +120,14 @@ class OpenDoor:
     def why_not(self, now: float) -> str:
         """Returns the reason to answer nothing now; empty: none."""
         return self._duty.why_not(now, now)
+
+    def may_write(self, port: Port) -> bool:
+        """Returns False for a program whose certificate has no role that may write."""
+        if self.settings.tls is None:
+            return True
+        from gateway.contract.access.certificates import may_write  # its TLS takes 10 ms
+
+        return may_write(self.settings.tls, port)
 
     def machine(self, line: Line, stores: Mapping[int, Store]) -> Answerer:
         """Returns an answering machine over these stores, by station number."""

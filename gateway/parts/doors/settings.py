@@ -2,11 +2,13 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from gateway.config.messages import Path, meant, one_of, shown
+from gateway.config.port_rules import SHOWS_ONE
 from gateway.config.settings import parsers
+from gateway.config.settings.model import LineTlsSection
 from gateway.config.settings.records import Config, LineConfig
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
@@ -16,6 +18,7 @@ from gateway.config.settings.setting_types import (
     Parsed,
     Text,
 )
+from gateway.config.settings.zenoh_records import tls_files
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Span
@@ -26,6 +29,7 @@ from gateway.transport.port import (
     Networks,
     SerialPath,
     TcpAddress,
+    TlsConfig,
     is_loopback,
     named,
 )
@@ -65,6 +69,8 @@ class DoorSection(Section):
     parity."""
     allow: Annotated[Networks | None, Parsed(parsers.networks, NETWORKS_SCHEMA)] = None
     """The addresses that may connect, such as [10.1.0.0/16]."""
+    tls: LineTlsSection | None = None
+    """The certificates of the door: programs connect by TLS."""
     writes: dict[str, list[Text]] = {}
     """By device: the addresses that may be written, such as {press: [D0..D99]}; left out: none."""
     most: Annotated[
@@ -108,6 +114,11 @@ class Door:
         where = self.where
         return where.path if isinstance(where, SerialPath) else named(where.host, where.port)
 
+    @property
+    def tls(self) -> TlsConfig | None:
+        """The certificates; None: it is open to read on the way."""
+        return self.where.tls if isinstance(self.where, TcpAddress) else None
+
     def stations(self, config: Config) -> dict[int, DeviceSettings]:
         """Returns the devices behind the door, by station number."""
         (line,) = (one for one in config.lines if one.name == self.line)
@@ -125,6 +136,10 @@ class Sharing:
     """All doors of the file."""
 
     doors: tuple[Door, ...]
+
+    def secured(self) -> Mapping[str, TlsConfig | None]:
+        """The certificates, by setting."""
+        return {f"share.doors.{one.name}.tls": one.tls for one in self.doors}
 
 
 def _place(settings: ShareSection | None, place: Place) -> Sharing | None:
@@ -177,7 +192,7 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
     return Door(
         name,
         line.name,
-        section.listen,
+        _secured_port(section, path, place),
         section.protocol,
         section.allow or (),
         _writes(section, devices, path, place),
@@ -186,6 +201,24 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
         section.idle,
         section.max_age or 0.0,
     )
+
+
+def _secured_port(section: DoorSection, path: Path, place: Place) -> TcpAddress | SerialPath:
+    """Returns the address with its certificates."""
+    where, own, path = section.listen, section.tls, (*path, "tls")
+    if own is None:
+        return where
+    if isinstance(where, SerialPath):
+        place.mistakes.add(path, "a terminal has no TLS: remove `tls`")
+        return where
+    if own.certificate is None:
+        place.mistakes.add(path, SHOWS_ONE)
+    if own.writers and not own.mutual:
+        text = "roles are in the certificates of programs: they need `mutual: true`"
+        place.mistakes.add((*path, "writers"), text)
+    if own.name:
+        place.mistakes.add((*path, "name"), "programs have roles: `writers`")
+    return replace(where, tls=tls_files(own.record(), place.folder, path, place.mistakes))
 
 
 def _why_not_reached(section: DoorSection) -> str:

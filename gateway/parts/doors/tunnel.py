@@ -59,6 +59,10 @@ class Tunnel:
 
     def opened(self, port: Port) -> None:
         self._program = port
+        if not self._door.may_write(port):  # with the wire alone it could do everything
+            self._door.turn_away(self._address)
+            self._door.start(port.close())
+            return
         self._door.guests.add(self)
         self._work = self._door.start(self._serve())
 
