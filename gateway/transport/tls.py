@@ -5,7 +5,7 @@ import ssl
 
 from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
-from gateway.transport.port import TlsConfig
+from gateway.transport.port import Port, TlsConfig
 from gateway.transport.stream import StreamPort
 
 READ_AGAIN = 60.0  # seconds: renewed files count for new connections, without a restart
@@ -104,8 +104,8 @@ def names_of(port: StreamPort) -> set[str]:
     return {text.lower() for kind, text in pairs if kind in ("commonName", "DNS", "IP Address")}
 
 
-def certificate_of(port: StreamPort) -> bytes:
+def certificate_of(port: Port) -> bytes:
     """Returns the certificate of the other side (DER); empty: it has shown none."""
-    transport = port.transport
+    transport = port.transport if isinstance(port, StreamPort) else None
     found = transport.get_extra_info("ssl_object") if transport is not None else None
     return b"" if found is None else found.getpeercert(binary_form=True) or b""

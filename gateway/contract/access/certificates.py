@@ -14,9 +14,6 @@ from gateway.contract.documents.state import CertificateDocument
 from gateway.contract.faults import certificate_fault
 from gateway.errors import ConfigError
 from gateway.tags.timestamps import rfc3339
-from gateway.transport import Port
-from gateway.transport.stream import StreamPort
-from gateway.transport.tls import certificate_of
 
 DAY = 86_400
 _UTC_TIME, _VERSION, _EXTENSIONS, _UTF8 = 0x17, 0xA0, 0xA3, 0x0C  # tags of ASN.1
@@ -90,10 +87,9 @@ def expires(content: bytes, *, last: bool = False) -> float:
     return max(found) if last else min(found)
 
 
-def may_write(tls: TlsConfig | None, port: Port) -> bool:
+def may_write(tls: TlsConfig, der: bytes) -> bool:
     """Returns False if the certificate of the other side has no role that may write."""
-    writers = () if tls is None else tls.writers
-    return not writers or (isinstance(port, StreamPort) and role(certificate_of(port)) in writers)
+    return not tls.writers or role(der) in tls.writers
 
 
 def role(der: bytes) -> str:

@@ -43,13 +43,12 @@ class Guest:
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._arrived = asyncio.Event()
         self._port: Port | None = None
-        self._may_write = False
         self._work: asyncio.Task[None] | None = None
 
     # The receiver of the connection
 
     def opened(self, port: Port) -> None:
-        self._port, self._may_write = port, self._door.may_write(port)
+        self._port = port
         self._work = self._door.start(self._serve())
         self._door.guests.add(self)
 
@@ -108,7 +107,7 @@ class Guest:
                 door.reads.note(step.device, run, loop.time())
             left = at + door.settings.reply_within - loop.time()
             outcome: Outcome
-            if step.writes and not self._may_write:
+            if step.writes and not self._may_write():
                 outcome = Denied(Why.NOT_ACCEPTED)
             elif left > 0:
                 by = f"door {door.settings.name}, {self._address}"
@@ -119,6 +118,9 @@ class Guest:
             self._outcomes[step.device].note(step, outcome)
             answered = answered and not isinstance(outcome, Unanswered)
         return answered
+
+    def _may_write(self) -> bool:
+        return self._port is not None and self._door.may_write(self._port)
 
     def _count(self, told: Heard) -> None:
         self._requests += len(told.done)

@@ -30,6 +30,7 @@ from gateway.transport import Port
 from gateway.transport.listen import Listener
 from gateway.transport.port import SerialSettings, TcpAddress, allows
 from gateway.transport.terminal import Terminal
+from gateway.transport.tls import certificate_of
 
 log = structlog.get_logger("gateway.line")
 T = TypeVar("T")
@@ -127,7 +128,7 @@ class OpenDoor:
             return True
         from gateway.contract.access.certificates import may_write  # its TLS takes 10 ms
 
-        return may_write(self.settings.tls, port)
+        return may_write(self.settings.tls, certificate_of(port))
 
     def machine(self, line: Line, stores: Mapping[int, Store]) -> Answerer:
         """Returns an answering machine over these stores, by station number."""

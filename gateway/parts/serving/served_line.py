@@ -35,6 +35,7 @@ from gateway.transport import (
     prepare,
 )
 from gateway.transport.listen import Listener
+from gateway.transport.tls import certificate_of
 
 log = structlog.get_logger("gateway.line")
 NEVER = float("inf")
@@ -197,7 +198,7 @@ class ServedLine:
             return True
         from gateway.contract.access.certificates import may_write  # its TLS takes 10 ms
 
-        return may_write(where.tls, port)
+        return may_write(where.tls, certificate_of(port))
 
     def machine(self, *, may_write: bool = True) -> Answerer:
         """Returns a new answering machine for the stations."""
