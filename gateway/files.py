@@ -47,6 +47,15 @@ def append(file: int, data: bytes, *, sync: bool = False) -> None:
         raise
 
 
+def sync(path: Path) -> None:
+    """Makes a file, or a new name in a folder, survive a power cut."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
 def is_file(path: Path) -> bool:
     """Returns True for a regular file. No name of a file raises an error."""
     try:

@@ -100,6 +100,7 @@ class Builder:
             state_file,
             lines,
             self._tags.recorded or self._sheets.recorded,
+            top.writers is not None,
         )
         return Config(
             name=top.gateway.name,

@@ -108,6 +108,7 @@ def warnings(documents: Documents) -> Iterator[str]:
     if reload.get("refused"):
         more = f" and {len(reload['why']) - 1} more" if len(reload["why"]) > 1 else ""
         yield f"the changed file was refused at {reload['refused']}: {reload['why'][0]}{more}"
+    yield from _of_remote(documents.get("remote/file", {"state": "none"}))
     clock = documents.get("clock", {})
     if (ago := clock.get("ago")) is not None and ago < JUMP_SHOWN:
         yield (
@@ -124,6 +125,14 @@ def warnings(documents: Documents) -> Iterator[str]:
         yield f"history: {lost} samples were lost since the start"
     if (days := disk_days(documents)) is not None and days < DAYS_OF_DISK:
         yield f"history: its disk is full in {days:.1f} days: make room, or a smaller `max_size`"
+
+
+def _of_remote(change: Document) -> Iterator[str]:
+    if change["state"] == "waiting":
+        back = f"it goes back at {change['until']}"
+        yield f"the file of {change['by']} waits for confirmation: {back}"
+    elif change["state"] == "failed":
+        yield f"the file of {change['by']} did not go back: {change['why']}"
 
 
 def disk_days(documents: Documents) -> float | None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PARTS = (
     *("history", "audit", "state", "serving", "doors", "transfers", "alarms"),
-    *("notify", "certificates", "damaged_files", "web"),
+    *("notify", "certificates", "damaged_files", "remote", "web"),
 )
 
 

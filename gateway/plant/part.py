@@ -13,6 +13,7 @@ or samples has a bound, which its module says.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gateway.config import Config
@@ -195,6 +196,21 @@ class Others(Protocol):
         """Has the audit keep an event, as JSON; `at`: ns since 1970. Never blocks."""
 
 
+class LoadedFile(Protocol):
+    """The configuration file of this gateway, and its reloads."""
+
+    @property
+    def path(self) -> Path: ...
+
+    @property
+    def current(self) -> Config:
+        """What the gateway has taken over."""
+
+    async def reload(self) -> Sequence[str]:
+        """Reads the file again. Returns when it was taken over, or why it was not: a sentence for
+        each mistake."""
+
+
 @dataclass(frozen=True, slots=True)
 class Core:
     """Everything that a part may use."""
@@ -204,6 +220,7 @@ class Core:
     history: Callable[[], History | None]
     others: Others
     start_over: Callable[[str], None] = nothing  # the gateway ends and starts again; the reason
+    file: LoadedFile | None = None  # None: the configuration is in no file
 
     @property
     def config(self) -> Config:

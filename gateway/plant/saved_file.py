@@ -78,7 +78,7 @@ class SavedFile:
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(self._path)
-            _sync(self._path.parent)
+            files.sync(self._path.parent)
         except OSError as error:
             if self.trouble != str(error):
                 self.trouble = str(error)
@@ -114,12 +114,3 @@ class SavedFile:
             log.warning("state file damaged", file=str(self._path), why=why, not_moved=str(error))
         else:
             log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))
-
-
-def _sync(folder: Path) -> None:
-    """Makes a new name survive a power cut."""
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)

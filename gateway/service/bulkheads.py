@@ -23,6 +23,7 @@ from gateway.plant.part import (
     Documented,
     Follows,
     Kind,
+    LoadedFile,
     Logged,
     Part,
     Phase,
@@ -201,9 +202,10 @@ class Bulkheads:
         kinds: Iterable[tuple[str, Kind]],
         north: North,
         start_over: Callable[[str], None] = nothing,
+        file: LoadedFile | None = None,
     ) -> None:
         """Makes the parts. Raises `ConfigError` for a mistake that only a part finds."""
-        core = Core(self._plant, north, self.history, self, start_over)
+        core = Core(self._plant, north, self.history, self, start_over, file)
         for name, kind in kinds:
             self._all.append(Bulkhead(name, kind, core, self._changed))
         self._changed()

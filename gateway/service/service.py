@@ -123,7 +123,7 @@ async def _serve(
         log.warning("gateway outdated", why=why)
         outdated.set()
 
-    parts.make(kinds(), northbound, start_over)
+    parts.make(kinds(), northbound, start_over, reloader)
     async with AsyncExitStack() as cleanup:  # in reverse order of the start
         clock.start()
         cleanup.callback(clock.stop)

@@ -41,6 +41,7 @@ class Place:
     state_file: FilePath | None
     lines: Sequence[LineConfig]
     recorded: Path | None  # the first tag with `history: true`
+    has_writers: bool  # requests need the signature of a named writer
 
     @property
     def tags(self) -> Sequence[Tag]:

@@ -61,6 +61,7 @@ _STATE: dict[str, Any] = {  # by path
     "history": state.HistoryDocument,
     "reload": state.ReloadDocument,
     "report": fleet.ReportDocument,
+    "remote/{file}": fleet.RemoteDocument,
     "standby": state.StandbyDocument,
     "claim/{session}": state.ClaimDocument,
 }
@@ -91,6 +92,7 @@ KINDS = (
         requests.AcknowledgeRequest,
     ),
     Kind("release", f"{_OWN}/doors/{{door}}", (SEND,), state.DoorDocument, requests.DoorRequest),
+    Kind("file order", f"{_OWN}/remote/file", (SEND,), fleet.RemoteDocument, fleet.RemoteOrder),
     Kind("audit", f"{_OWN}/audit/{{number}}", (PAST,), requests.AuditRecord),
     Kind("trace", f"{_OWN}/lines/{{line}}/@trace", (SUBSCRIBE,), requests.TraceDocument),
     Kind("description", f"{_OWN}/@describe", (GET,), dict[str, Any]),

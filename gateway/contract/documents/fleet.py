@@ -1,9 +1,11 @@
 """The short report of a gateway, for those who look after many: docs/fleet.md."""
 
+from typing import Annotated, Literal, NotRequired
+
 from typing_extensions import TypedDict
 
 from gateway.contract.documents.state import Standing
-from gateway.contract.documents.values import Number, Time
+from gateway.contract.documents.values import Number, Time, words
 
 
 class ReportDocument(TypedDict):
@@ -37,3 +39,28 @@ class ReportDocument(TypedDict):
     certificate_days: float | None
     disk_days: float | None
     stand: str | None
+
+
+class RemoteDocument(TypedDict):
+    """The last file that a writer gave the gateway. `until`: then it goes back, unless somebody
+    confirms it. `digest`, `before`: of that file, and of the one before. `earlier`: digests of the
+    files that are kept, the newest last."""
+
+    state: Annotated[str, words("none", "waiting", "confirmed", "reverted", "failed")]
+    by: str
+    at: Time | None
+    until: Time | None
+    digest: str
+    before: str
+    why: str
+    earlier: list[str]
+
+
+class RemoteOrder(TypedDict):
+    """`file`: the whole text; `confirm`: seconds until it goes back; `digest`: of the file that is
+    confirmed, or of the earlier one that comes back."""
+
+    do: Literal["check", "apply", "confirm", "revert", "rollback"]
+    file: NotRequired[str]
+    confirm: NotRequired[float]
+    digest: NotRequired[str]

@@ -31,9 +31,11 @@ class Reloader:
 
     def __init__(self, path: Path, current: Config, wall: Callable[[], int] = time.time_ns) -> None:
         self.current = current
-        self._path = path
+        self.path = path
         self._wall = wall
         self._wanted = asyncio.Event()
+        self._asked: list[asyncio.Future[Sequence[str]]] = []  # since the last read began
+        self._told: list[asyncio.Future[Sequence[str]]] = []  # of the read that goes on
         self._watch = Watch()
         self._loaded = wall()
         self._count = 0
@@ -44,6 +46,13 @@ class Reloader:
     def want(self) -> None:
         """Reads the file again as soon as the reload before has ended."""
         self._wanted.set()
+
+    async def reload(self) -> Sequence[str]:
+        """Reads the file again. Returns when it was taken over, or why it was not."""
+        end: asyncio.Future[Sequence[str]] = asyncio.get_running_loop().create_future()
+        self._asked.append(end)
+        self.want()
+        return await end
 
     async def watch(self) -> None:
         """Runs until cancelled: wants a reload after each change, if the file says so."""
@@ -60,10 +69,11 @@ class Reloader:
         """Waits until a reload is wanted. Returns the content of the file; None: it is refused."""
         await self._wanted.wait()
         self._wanted.clear()
+        self._told, self._asked = [*self._told, *self._asked], []
         try:
             found = await off_loop(self._read, within=READ_WITHIN)
         except GatewayError:
-            found = [f"{self._path}, or a file that it names, does not answer"]
+            found = [f"{self.path}, or a file that it names, does not answer"]
         if isinstance(found, Config):
             return found
         self.refuse(found)
@@ -72,6 +82,7 @@ class Reloader:
     def refuse(self, why: Sequence[str]) -> None:
         """Notes that the file changes nothing, with a sentence for each mistake."""
         self._refused = self._wall(), why
+        self._tell(why)
         for sentence in why[:_MOST_LOGGED]:
             log.error("file refused", why=sentence, effect=_EFFECT)
         if len(why) > _MOST_LOGGED:
@@ -83,15 +94,22 @@ class Reloader:
         """Notes that the gateway has taken over the file."""
         self.current, self._refused = config, None
         self._loaded, self._revision = self._wall(), self._read_revision
+        self._tell(())
         self._count += 1
         changes = () if difference is None else difference.devices.values()
         log.info(
             "file reloaded",
-            file=str(self._path),
+            file=str(self.path),
             added=[change.name for change in changes if change.old is None],
             changed=[change.name for change in changes if change.old and change.new],
             removed=[change.name for change in changes if change.new is None],
         )
+
+    def _tell(self, why: Sequence[str]) -> None:
+        told, self._told = self._told, []
+        for end in told:
+            if not end.done():
+                end.set_result(why)
 
     @property
     def says(self) -> str:
@@ -104,7 +122,7 @@ class Reloader:
         """Returns the state of the file, for the status."""
         at, why = self._refused or (None, ())
         return {
-            "file": str(self._path),
+            "file": str(self.path),
             "loaded": rfc3339(self._loaded),
             "digest": self.current.digest,
             "revision": self._revision,
@@ -116,20 +134,20 @@ class Reloader:
     def _note(self) -> None:
         """Notes the files before they are read. Blocks."""
         self._watch.note(self._files())
-        self._read_revision = _revision(self._path)
+        self._read_revision = _revision(self.path)
 
     def _files(self) -> list[Path]:
-        return list(dict.fromkeys([self._path, *(sheet.file for sheet in self.current.sheets)]))
+        return list(dict.fromkeys([self.path, *(sheet.file for sheet in self.current.sheets)]))
 
     def _read(self) -> Config | list[str]:
         """Returns the content of the file, or what is wrong with it."""
         self._note()
         try:
-            config = load(self._path)
+            config = load(self.path)
         except ConfigErrors as error:
             return str(error).splitlines()
         changed = needs_restart(self.current, config)
-        return [f"{self._path}: {one} changed: this needs a restart" for one in changed] or config
+        return [f"{self.path}: {one} changed: this needs a restart" for one in changed] or config
 
 
 def _revision(file: Path) -> str | None:

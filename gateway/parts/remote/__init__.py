@@ -1,0 +1,1 @@
+"""Another configuration file over Zenoh: checked here, loaded, and put back by itself."""
