@@ -21,7 +21,9 @@ class RemoteSection(Section):
     path: FilePath = Path("remote.json")
 
 
-def _place(settings: RemoteSection, place: Place) -> RemoteSection:
+def _place(settings: RemoteSection | None, place: Place) -> RemoteSection | None:
+    if settings is None:
+        return None
     if not place.has_writers:
         text = "it needs writers: {file: writers.txt}: a file must have the signature of a writer"
         place.mistakes.add(("remote", "writers"), text)
