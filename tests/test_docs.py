@@ -33,6 +33,7 @@ from gateway.config.settings.sections import part_sections
 from gateway.config.yaml.file import read_yaml
 from gateway.contract import payload
 from gateway.contract.access import certificates
+from gateway.contract.documents.fleet import RemoteDocument
 from gateway.contract.keys import Keys
 from gateway.contract.meta import meta
 from gateway.contract.problems import Problem
@@ -294,7 +295,7 @@ def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) 
 
 
 def test_every_section_of_the_file_is_on_the_page() -> None:
-    pages = CONFIGURATION + TEXT["templates.md"]
+    pages = CONFIGURATION + TEXT["templates.md"] + TEXT["remote.md"]
     headings = set(re.findall(r"^## (\w+)$", pages, re.MULTILINE))
     assert set(schema()["properties"]) - {"defaults", "lines"} <= headings
 
@@ -720,6 +721,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
     known |= Standby(GroupSettings("hall"), None, Keys("plant", "demo"), SendPermit()).documents()
     known["certificates/"] = certificates.document(tmp_path, 0.0, 0.0)
     known["notify/"] = Outbox(1.0).document()
+    known["remote/"] = dict.fromkeys(RemoteDocument.__annotations__)  # compared in tests/remote
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)
@@ -739,7 +741,12 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
 
 def page_of(document: str) -> str:
     """The page with the fields of a status document."""
-    pages = {"`doors": "share.md", "`notify": "notify.md", "`report`": "fleet.md"}
+    pages = {
+        "`doors": "share.md",
+        "`notify": "notify.md",
+        "`report`": "fleet.md",
+        "`remote": "remote.md",
+    }
     return pages.get(document.partition("/")[0], "status.md")
 
 

@@ -26,6 +26,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "status": ("plant.yaml --watch", "plant.yaml --json"),
     "health": ("plant.yaml", "plant.yaml --strict"),
     "fleet": ("works --connect tcp/router:7447", "works --folder files --remember seen.json"),
+    "remote": ("plant.yaml new.yaml", "plant.yaml new.yaml --yes --within 5min"),
     "line": ("plant.yaml hall-1", "plant.yaml hall-1 release"),
     "doctor": ("plant.yaml", "plant.yaml --json"),
     "alarms": ("plant.yaml", "plant.yaml --ack mixer/level --by ana"),

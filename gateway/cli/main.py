@@ -39,6 +39,7 @@ _COMMANDS = {
     "status": "status:status",
     "health": "status:health",
     "fleet": "fleet:fleet",
+    "remote": "remote:remote",
     "line": "line.shared:line",
     "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",

@@ -153,7 +153,7 @@ POINTS = {
     "damaged_files": ("run", "documents"),
     "web": ("run",),
 }
-QUIET = {"certificates"}  # the file of this plant does not want it
+QUIET = {"certificates", "remote"}  # the file of this plant does not want them
 
 
 def test_every_part_is_hurt() -> None:

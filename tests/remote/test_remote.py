@@ -178,7 +178,7 @@ def test_a_file_that_a_person_changed_meanwhile_is_left_alone(
         gateway = Gateway(tmp_path)
         part = await gateway.part()
         gateway.path.write_text(file("D7"))
-        with pytest.raises(BadValue, match="somebody works on it"):
+        with pytest.raises(BadValue, match="a person works on it"):
             await ask(part, "apply", file=file("D1"))
         gateway.path.write_text(file("D0"))
         await ask(part, "apply", file=file("D1"))

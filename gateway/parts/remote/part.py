@@ -147,7 +147,7 @@ class RemotePart:
         if found.digest == running:
             raise BadValue("the gateway runs a file with these settings already")
         if await off_loop(self._folder.digest, within=DISK_WITHIN) != running:
-            raise BadValue("the file on disk was changed and not loaded: somebody works on it")
+            raise BadValue("the file on disk was changed and not loaded: a person works on it")
         now = self._core.plant.wall()
         copy = await off_loop(self._folder.keep, running, now, within=DISK_WITHIN)
         seconds = confirm or self._settings.confirm

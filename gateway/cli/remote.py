@@ -1,0 +1,95 @@
+"""The `remote` command: gives a running gateway another file, and confirms it when all is well."""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gateway import files
+from gateway.cli.client import Client, reached
+from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
+from gateway.config.settings.parsers import interval
+from gateway.contract.faults import faults
+from gateway.errors import ConfigError
+
+_KEY = "remote/file"
+
+
+def remote(
+    config: ConfigPath,
+    new: Annotated[Path | None, typer.Argument(metavar="[NEW]", help="The other file.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Check it on the gateway only.")] = False,
+    rollback: Annotated[
+        str | None, typer.Option(metavar="DIGEST", help="An earlier file instead of NEW.")
+    ] = None,
+    revert: Annotated[bool, typer.Option("--revert", help="Take back what waits.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Confirm it without a question, if no fault is new.")
+    ] = False,
+    look: Annotated[str, typer.Option(help="How long to look for new faults.")] = "20s",
+    within: Annotated[str, typer.Option(help="Then an unconfirmed file goes back.")] = "10min",
+) -> None:
+    """Give a running gateway another file, which goes back by itself unless confirmed."""
+    if sum((new is not None, rollback is not None, revert)) > 1 or (check and new is None):
+        raise ConfigError("write one of NEW, --rollback DIGEST and --revert; --check needs NEW")
+    looks, order = interval(look), _order(new, rollback, check=check, revert=revert)
+    with reached(config, err.print) as client:
+        if order is None:
+            print(json.dumps(client.status(_KEY)))
+            return
+        before = _faults(client)
+        if order["do"] in ("apply", "rollback"):
+            order["confirm"] = interval(within)
+        found = _sent(client, order)
+        if found["state"] != "waiting":
+            good = "the gateway would take this file"
+            out.print(good if check else printable(f"{found['state']}: {found['why']}"))
+            return
+        out.print(f"loaded; it goes back at {found['until']} unless it is confirmed")
+        until = time.monotonic() + looks
+        while time.monotonic() < until:
+            time.sleep(min(1.0, looks))
+        new_faults = _faults(client) - before
+        for fault in sorted(new_faults):
+            err.print(printable(f"new: {fault}"))
+        if new_faults and yes:
+            end("a fault is new: the file is not confirmed, and goes back by itself", FAILED)
+        if yes or typer.confirm("Keep it?"):
+            _sent(client, {"do": "confirm", "digest": found["digest"]})
+            out.print(f"{found['digest']} is confirmed")
+        else:
+            _sent(client, {"do": "revert"})
+            out.print("the file before is back")
+
+
+def _order(
+    new: Path | None, rollback: str | None, *, check: bool, revert: bool
+) -> dict[str, Any] | None:
+    """Raises `ConfigError`."""
+    if rollback is not None:
+        return {"do": "rollback", "digest": rollback}
+    if revert:
+        return {"do": "revert"}
+    if new is None:
+        return None
+    try:
+        text = files.read(new).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{new} cannot be read: {error}") from None
+    return {"do": "check" if check else "apply", "file": text}
+
+
+def _sent(client: Client, order: dict[str, Any]) -> dict[str, Any]:
+    answer = client.order(_KEY, order)
+    if "error" in answer:
+        print(printable(str(answer["reason"])), file=sys.stderr)
+        sys.exit(FAILED)
+    return answer
+
+
+def _faults(client: Client) -> set[str]:
+    """Returns the sentences of what is wrong, without the times in them."""
+    return {one.partition(" (for ")[0] for one in faults(client.documents())}
