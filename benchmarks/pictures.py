@@ -10,7 +10,7 @@ import asyncio
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,8 @@ VIEWS = {
     "trend": TREND,
     "search": "tags?find=oven",
 }
+PLANTS = ("well", "fault", "many", "large")
+ACKNOWLEDGED = {"fault": ("drive-3",), "many": ("mixer/speed", "line:yard", "boiler/flow")}
 LARGE = Sizes(10, 5, 100)
 DOCS = {
     "bench.png": "bench-laptop-light.png",
@@ -229,18 +231,17 @@ async def run(arguments: argparse.Namespace) -> None:
     async with AsyncExitStack() as stack:
         await ports.serve(stack)
         with tempfile.TemporaryDirectory() as folder, ExitStack() as programs:
-            situations = list(files(Path(folder), ports))
+            situations = [one for one in files(Path(folder), ports) if one[0] in arguments.plants]
             for _, path, _ in situations:
                 programs.enter_context(started(path))
             await asyncio.sleep(arguments.after)
-            for name, path, _ in situations[1:3]:
-                await asyncio.to_thread(acknowledge, path, name)
+            for name, path, _ in situations:
+                await asyncio.to_thread(acknowledge, path, ACKNOWLEDGED.get(name, ()))
             await look(situations, arguments)
 
 
-def acknowledge(path: Path, name: str) -> None:
+def acknowledge(path: Path, alarms: Sequence[str]) -> None:
     """Acknowledges some alarms, so that the pictures have each state."""
-    alarms = {"fault": ("drive-3",), "many": ("mixer/speed", "line:yard", "boiler/flow")}[name]
     for alarm in alarms:
         plc_gateway("alarms", path, "--ack", alarm, "--by", "Ana")
 
@@ -251,6 +252,7 @@ def main() -> None:
     parser.add_argument("--docs", action="store_true", help="copy some to docs/")
     parser.add_argument("--chromium", default="chromium")
     parser.add_argument("--after", type=float, default=75.0, help="seconds that the gateways run")
+    parser.add_argument("--plants", nargs="+", choices=PLANTS, default=PLANTS)
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--schemes", nargs="+", choices=SCHEMES, default=SCHEMES)
     arguments = parser.parse_args()

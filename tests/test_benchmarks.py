@@ -113,7 +113,8 @@ TINY = [
         [r"^the lines take [\d.]+% of a processor", r"^one scrape: [\d.]+ MB"],
     ),
 ]
-PICTURES = ["pictures", "--after", "0", "--sizes", "phone", "--schemes", "light", "--into"]
+PICTURES = ["pictures", "--after", "0", "--plants", "many", "--sizes", "phone"]
+PICTURES += ["--schemes", "light", "--into"]
 BY_OTHER_TESTS = {
     "moves",
     "structure",

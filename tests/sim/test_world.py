@@ -14,14 +14,14 @@ from tests.sim.draw import Drawn, draw
 from tests.sim.world import run
 
 ROOT = Path(__file__).parents[2]
-LEAN, BUSY, HOSTILE = range(6), range(100, 103), (100_000, 100_001)
+LEAN, BUSY, HOSTILE = (0, 1, 2, 10, 16, 39), range(100, 103), (100_000, 100_001)
 GROUPS = (700_102,)
 LATER = 910_300  # with arrays and transfers
 
 
 def test_the_seeds_contain_every_protocol_setting_and_fault() -> None:
     """Each is in one of the plants of the tests below."""
-    slice_of = [*(draw(n, 3600.0, "lean") for n in LEAN), *(draw(n, 300.0) for n in BUSY)]
+    slice_of = [*(draw(n, 1800.0, "lean") for n in LEAN), *(draw(n, 150.0) for n in BUSY)]
     assert _there(slice_of) == _there(draw(n, 3600.0, "lean") for n in range(200))
 
 
@@ -40,20 +40,20 @@ def _there(plants: Iterable[Drawn]) -> set[str]:
 
 
 @pytest.mark.parametrize("seed", LEAN)
-def test_an_hour_of_faults_breaks_no_rule(seed: int) -> None:
-    story = run(seed, 1.0, "lean")
+def test_half_an_hour_of_faults_breaks_no_rule(seed: int) -> None:
+    story = run(seed, 0.5, "lean")
     assert not story.broken, "\n".join([story.replay(), *story.broken])
 
 
 @pytest.mark.parametrize("seed", BUSY)
-def test_five_minutes_on_full_wires_break_no_rule(seed: int) -> None:
-    story = run(seed, 1 / 12, "busy")
+def test_minutes_on_full_wires_break_no_rule(seed: int) -> None:
+    story = run(seed, 1 / 24, "busy")
     assert not story.broken, "\n".join([story.replay(), *story.broken])
 
 
 @pytest.mark.parametrize("seed", HOSTILE)
 def test_other_parties_on_the_line_break_no_rule(seed: int) -> None:
-    story = run(seed, 0.3, "hostile")
+    story = run(seed, 0.15, "hostile")
     assert not story.broken, "\n".join([story.replay(), *story.broken])
 
 
