@@ -1,3 +1,1 @@
-"""The `fleet` command: all gateways under a prefix, the worst first."""
-
-from gateway.cli.fleet.command import fleet
+"""Commands for many gateways: who runs what, and another file for one from afar."""
