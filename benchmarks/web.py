@@ -28,7 +28,8 @@ from gateway.contract import payload
 from gateway.contract.faults import Documents
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web.connections import Who
-from gateway.parts.web.events import WIRE_EVERY, Events, Loads, Page
+from gateway.parts.web.events import WIRE_EVERY, Events, Page
+from gateway.parts.web.line_past import Loads
 from gateway.parts.web.tag_list import TagList
 from gateway.plant.part import Core
 from gateway.plant.plant import Plant

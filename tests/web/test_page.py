@@ -90,6 +90,11 @@ async def test_values_are_shown_first_with_unit_decimals_limits_and_alarm(tab: T
         assert await tab.value('document.querySelector("#tiles img")') is None
         assert "hall" in await tab.value(text("#lines-short"))
         assert "oven is silent" in await tab.value(text("#wrong"))
+        await tab.value('location.hash = "#lines"')
+        await tab.until("document.querySelectorAll('.past rect.wrong').length === 1")
+        assert "oven is silent: No byte came back" in await tab.value(
+            "document.querySelector('.past title').textContent"
+        )
         # Nobody can write without a file of tokens.
         assert await tab.value(
             '[...document.querySelectorAll("button")].every((one) => one.hidden'

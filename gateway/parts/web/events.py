@@ -7,10 +7,9 @@ nothing for `SLOW` seconds is dropped.
 
 import asyncio
 import time
-from collections import ChainMap, deque
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Any
 
 import orjson
@@ -20,6 +19,7 @@ from gateway.contract import payload
 from gateway.contract.faults import Documents, below, causes, transfers
 from gateway.parts.web.api import overview
 from gateway.parts.web.connections import Places, Who
+from gateway.parts.web.line_past import Loads
 from gateway.parts.web.routes import Route, Word, drop
 from gateway.parts.web.tag_list import TagList
 from gateway.parts.web.wire import Recorder, Wires, as_fields
@@ -33,49 +33,10 @@ SLOW = 5.0  # seconds
 WIRE_EVERY = 0.25  # seconds between two events with exchanges
 VALUES_EVERY = 1.0
 STATE_EVERY = 2.0
-LOAD_EVERY = 5.0  # as often as the status is published: it costs nothing more
-KEPT_LOADS = 360  # half an hour
-_BY_NAME = ("devices", "transfers")  # of the state: a page gets their changes
+_BY_NAME = ("devices", "transfers", "timelines")  # of the state: a page gets their changes
 MOST_SENTENCES = 50  # about what is wrong, and about what to look at
 _LINE = Word("line", "With the exchanges of this line")
 _CHOSEN = Word("tags", "With these values: keys with commas; left out: those of the overview")
-
-
-class Loads:
-    """The load of each line in the last half hour."""
-
-    def __init__(self, core: Core) -> None:
-        self._north = core.north
-        self._last: Mapping[str, float] = {}
-        self._at = 0.0
-        self._loads: dict[str, deque[float]] = {}
-        self.number = 0  # of measurements
-
-    async def run(self) -> None:
-        """Runs until cancelled."""
-        while True:
-            self._take(await self._north.documents(LOAD_EVERY))
-            await asyncio.sleep(LOAD_EVERY)
-
-    def since(self, number: int) -> dict[str, list[float]]:
-        """Returns the loads of each line after that measurement."""
-        new = min(self.number - number, KEPT_LOADS)
-        return {
-            name: [*islice(loads, max(0, len(loads) - new), None)]
-            for name, loads in self._loads.items()
-        }
-
-    def _take(self, documents: Documents) -> None:
-        up = documents["status"]["up"]
-        busy = {name: one["busy_time"] for name, one in below("lines/", documents)}
-        if (passed := up - self._at) <= 0:
-            return  # the same documents
-        for name, seconds in busy.items():
-            if (before := self._last.get(name)) is not None:
-                load = min(1.0, max(0.0, (seconds - before) / passed))
-                self._loads.setdefault(name, deque(maxlen=KEPT_LOADS)).append(round(load, 3))
-        self.number += 1
-        self._last, self._at = busy, up
 
 
 class Events:
@@ -109,7 +70,8 @@ class Events:
         """Returns the state as all pages get it; made once for the same documents."""
         if self._state[0] is not documents:
             shown = ChainMap(*[part.shown() for part in self._core.others.each(Shown)])
-            self._state = documents, {**_state(documents), **shown}
+            timelines = {"timelines": {**self.loads.timelines}}
+            self._state = documents, {**_state(documents), **timelines, **shown}
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:

@@ -16,8 +16,9 @@ from gateway.parts.web import metrics, openapi
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
-from gateway.parts.web.events import Events, Loads
+from gateway.parts.web.events import Events
 from gateway.parts.web.guard import Guard
+from gateway.parts.web.line_past import Loads
 from gateway.parts.web.listener import Listener, file_route, files_of
 from gateway.parts.web.routes import Route
 from gateway.parts.web.settings import WebSection

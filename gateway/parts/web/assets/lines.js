@@ -1,18 +1,21 @@
 // What is wrong, the lines with their causes, devices folded below; calls and transfers.
 
-import { byId, clock, h, keyed, put, span, style, svg } from "./dom.js";
+import { byId, clock, h, keyed, moment, put, span, style, svg } from "./dom.js";
 import { gateway, now, on, post, signedIn } from "./stream.js";
 import { wireOf } from "./wire.js";
 
 const KEPT = 360; // loads of a line: half an hour
 const SHORT = 4; // sentences of the overview before the rest is folded
 const LINES = 8; // of the overview
+const DAY = 86400e3; // ms
+const SHOWN_STATES = 12;
 const SHOWN = 200; // devices or transfers
 const ORDER = { silent: 0, failing: 1, starting: 2, up: 3 };
 
 export const devices = new Map(); // [line, state, why] by name
 const loads = new Map();
 const transfers = new Map();
+const timelines = new Map(); // [ms, kind, cause] of each state, the oldest first
 let lines = [];
 let doors = []; // with programs
 let origins = {}; // of lines without real devices
@@ -25,7 +28,7 @@ on("begin", () => {
 let begun = false; // the next state has all devices and transfers
 
 on("state", (state) => {
-  if (begun) for (const known of [devices, transfers]) known.clear();
+  if (begun) for (const known of [devices, transfers, timelines]) known.clear();
   begun = false;
   const waiting = state.standby ? `, ${state.standby}` : "";
   const history = state.history === null ? "no history" : state.history === "ok" ? "history ok" : "history not ok";
@@ -36,6 +39,7 @@ on("state", (state) => {
   origins = state.origins;
   merge(devices, state.devices);
   merge(transfers, state.transfers);
+  merge(timelines, state.timelines);
   showWrong(state);
   showLines();
   showCalls(state.calls);
@@ -163,12 +167,16 @@ function makeLine([name]) {
   card.chart = svg("svg", { viewBox: "0 0 360 22", preserveAspectRatio: "none", class: "load", role: "img" });
   card.chart.append(svg("polyline"));
   card.load = h("span", { className: "soft" });
+  card.past = svg("svg", { viewBox: "0 0 1000 10", preserveAspectRatio: "none", class: "past", role: "img" });
+  card.changes = h("summary");
+  card.states = h("ul", { className: "rows" });
+  card.timeline = h("details", {}, card.changes, card.states);
   card.summary = h("summary");
   card.devices = h("ul", { className: "rows" });
   card.wire = h("div");
   card.fold = h("details", { ontoggle: () => showDevices(card, name) }, card.summary, card.devices);
   card.button = h("button", { type: "button", className: "quiet", "aria-label": `wire of ${name}`, onclick: () => wireOf(name, card.wire, card.button) }, "Wire");
-  card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, card.doors, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
+  card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, card.past, card.timeline, card.doors, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
   return card;
 }
 
@@ -188,6 +196,7 @@ function showLine(card, line) {
     put(item.head, rest ? `${head}: ` : head);
     put(item.rest, rest);
   });
+  showTimeline(card, name, timelines.get(name) ?? []);
   keyed(card.doors, doors.filter(([, of]) => of === name), ([door]) => door, ([door]) => {
     const item = h("li");
     item.text = h("span");
@@ -208,6 +217,23 @@ function showLine(card, line) {
   const up = of.filter(([, [, state]]) => state === "up").length;
   put(card.summary, `${of.length} ${of.length === 1 ? "device" : "devices"}, ${up} up`);
   showDevices(card, name, of);
+}
+
+// A band of the states since the gateway started, at most of a day, and the newest ones as text.
+function showTimeline(card, name, states) {
+  const until = now() || Date.now();
+  const from = Math.max(states[0]?.[0] ?? until, until - DAY);
+  const x = (time) => (1000 * (Math.max(time, from) - from)) / Math.max(until - from, 1);
+  const spans = states.map(([time, kind, cause], at) => ({ time, kind, cause, end: states[at + 1]?.[0] ?? until })).filter(({ end }) => end >= from);
+  card.past.replaceChildren(...spans.map(({ time, kind, cause, end }) => {
+    const part = svg("rect", { x: x(time), width: Math.max(x(end) - x(time), 2), height: 10, class: kind });
+    part.append(Object.assign(svg("title"), { textContent: `${clock(time)}: ${cause || kind}` }));
+    return part;
+  }));
+  card.past.setAttribute("aria-label", `states of ${name} in the last ${span((until - from) / 1000)}`);
+  const changes = Math.max(0, spans.length - 1);
+  put(card.changes, `${changes} ${changes === 1 ? "change" : "changes"} in the last ${span((until - from) / 1000)}`);
+  keyed(card.states, spans.reverse().slice(0, SHOWN_STATES), ({ time }) => time, ({ kind }) => h("li", { className: kind }), (item, { time, kind, cause, end }) => put(item, `${moment(time)}, ${span((end - time) / 1000)}: ${cause || kind}`));
 }
 
 async function release(door, item) {
