@@ -22,6 +22,7 @@ PC_ON_DEMAND = "FE"  # the PC number of data that the PLC sends by itself
 LONGEST_DATA = 256  # characters between PC number and ETX: 64 words, 256 bits, a loopback of 254
 
 _HEX = frozenset(b"0123456789ABCDEF")
+_DATA_BEHIND = "data behind ACK or NAK"
 _ROUTE = 4  # station and PC number, two characters each
 
 
@@ -73,6 +74,7 @@ class LinkCodec:
         self._end = CRLF if frame_format == 4 else b""
         self._sum_check = sum_check
         self._buffer = bytearray()
+        self._bare = False  # the last block was an answer without CR LF
         self._sent: tuple[bytes, Enquiry] | None = None
 
     def encode(self, frame: Frame) -> bytes:
@@ -120,6 +122,9 @@ class LinkCodec:
 
         Zero: the block is incomplete.
         """
+        if self._bare and self._buffer[0] in _HEX:
+            raise Garbled(_DATA_BEHIND, bytes(self._buffer), evidence=Evidence.CHECKSUM)
+        self._bare = False
         match self._buffer[0]:
             case start if start == STX:
                 return self._take_text()
@@ -160,6 +165,10 @@ class LinkCodec:
             return 1
         if len(buffer) < 1 + length or not self._ends_at(1 + length + len(self._end)):
             return 0
+        # One wrong bit makes ACK of STX: then the data of the block follow.
+        if not self._end and len(buffer) > 1 + length and buffer[1 + length] in _HEX:
+            raise Garbled(_DATA_BEHIND, bytes(buffer), evidence=Evidence.CHECKSUM)
+        self._bare = not self._end
         text = buffer[1 : 1 + length].decode("ascii")
         station, pc, code = int(text[:2], 16), text[2:4], text[4:]
         frame: Frame = Nak(station, code, pc) if buffer[0] == NAK else Ack(station, pc)
