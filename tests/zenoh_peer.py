@@ -42,6 +42,7 @@ from zenoh import ext
 
 TIMEOUT = 300.0  # seconds; never waited for when all is well
 ANSWER_WITHIN = 20.0  # seconds for the replies to one query
+POLL = 0.03  # seconds between two queries for what is not there yet: three processes would spin
 # A query that every gateway answers. Zenoh does not wait for a declaration to arrive, but earlier
 # declarations go the same way before the query.
 BARRIER = "*/@gateway/*/status"
@@ -243,7 +244,7 @@ class ZenohPeer:
         """Waits until exactly these tokens are declared under `key`."""
         async with asyncio.timeout(timeout):
             while await self.tokens(key) != tokens:
-                pass
+                await asyncio.sleep(POLL)
 
     async def get(
         self,
@@ -268,6 +269,7 @@ class ZenohPeer:
                 for reply in await self.get(selector):
                     if fits(reply.json):
                         return reply.json
+                await asyncio.sleep(POLL)
 
     async def many(
         self,

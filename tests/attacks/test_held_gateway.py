@@ -13,7 +13,7 @@ from gateway.line.send_permit import SETTLE
 from gateway.northbound.group.election import LONGEST_PAUSE
 from tests.attacks.tcp_peer import peer, tcp_reply
 from tests.e2e.processes import Program, free_port, started, station, vigor_line, write_config
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
 HOLD = HELD + 0.3  # seconds
@@ -40,7 +40,7 @@ async def until_taken(client: ZenohPeer, payload: bytes) -> None:
     """Writes until the gateway has forgotten its hold."""
     async with asyncio.timeout(10 * SETTLE):
         while not (await client.get(RECIPE, payload))[0].ok:
-            pass
+            await asyncio.sleep(POLL)
 
 
 async def test_a_write_that_arrived_while_the_gateway_was_held_is_refused(tmp_path: Path) -> None:

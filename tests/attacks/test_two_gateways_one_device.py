@@ -20,7 +20,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
 
@@ -219,4 +219,4 @@ async def test_a_gateway_that_was_frozen_keeps_its_device_when_it_wakes(tmp_path
         await p.until_alive("left/alive/mixer")
         async with asyncio.timeout(10 * SETTLE):  # so long it refuses what may be of the past
             while not (await p.client.get(RECIPE, b"7", target="ALL"))[0].ok:
-                pass
+                await asyncio.sleep(POLL)

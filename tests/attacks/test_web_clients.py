@@ -10,7 +10,7 @@ from gateway.parts.history.store.file import HistoryFile
 from tests.e2e.processes import free_port, started, vigor_line, write_config
 from tests.history.recorded import SPEED, numbered, store_run
 from tests.northbound.access import secret
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import POLL, free_endpoint
 
 TOKEN = "t" * 40
 END = "\r\n"
@@ -92,7 +92,7 @@ async def test_no_client_of_the_web_side_harms_another(tmp_path: Path) -> None:
                 assert found == dict.fromkeys(FOR_ALL, 200)
         async with asyncio.timeout(300):
             while await status(port, "GET /api/tags") != 200:
-                pass  # the places of those who left
+                await asyncio.sleep(POLL)  # the places of those who left
 
         for request, (coding, body, code) in REFUSED.items():
             more = f"{coding}{BODY.format(len(body))}\r\n{body}"
@@ -109,7 +109,7 @@ async def test_no_client_of_the_web_side_harms_another(tmp_path: Path) -> None:
         # The refused write is part of the state that the page shows.
         async with asyncio.timeout(300):
             while b'"bad-value":1' not in await whole(port, "GET /api/status"):
-                pass
+                await asyncio.sleep(POLL)
         events = asking(port, "GET /api/events", CLOSE)
         async with asyncio.timeout(300), events as (reader, _):
             shown = b""

@@ -7,7 +7,7 @@ from pathlib import Path
 from gateway.parts.audit.file import checked, read
 from tests.attacks.tcp_peer import peer, tcp_reply
 from tests.e2e.processes import plc_gateway, started, vigor_line, write_config
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
 
 WRITES, OPERATORS, STATIONS = 12, 60, 32
 QUICK = {"reply_timeout": "50ms", "late_guard": "0s", "retries": 0}
@@ -61,10 +61,11 @@ async def test_operators_see_every_deed_and_each_cause_once(tmp_path: Path) -> N
                 while unclear < WRITES:  # between them the device is offline
                     [reply] = await client.get("plant/plc/recipe/@set", b"%d" % unclear)
                     unclear += reply.json["error"] == "unclear"
+                    await asyncio.sleep(POLL)
 
                 key = f"{ALARMS}/mixer"
                 while {one.json["state"] for one in await client.get(f"{key}/*")} != {"active"}:
-                    pass
+                    await asyncio.sleep(POLL)
                 answers = await client.many(
                     [(f"{key}/t{n}", b'{"by": "Ana %d"}' % n) for n in range(OPERATORS)]
                 )

@@ -21,7 +21,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
 
 WITHIN = 2.0  # s: the contract's promise for SIGTERM and Ctrl-C
 
@@ -114,7 +114,7 @@ async def test_writes_in_flight_and_in_the_queue_get_a_reply(
     with started(slow_plant.config) as gateway:
         async with ZenohPeer("client", connect=[slow_plant.endpoint]) as client:
             while (await client.get("plant/mixer/other"))[0].json["quality"] != "good":
-                pass  # then nothing is polled for an hour
+                await asyncio.sleep(POLL)  # then nothing is polled for an hour
             plc.tell("delay 1 4")
             writing = asyncio.create_task(
                 client.many([(f"plant/mixer/{tag}/@set", b"7") for tag in ("recipe", "other")])
@@ -167,7 +167,7 @@ async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(
                 while not (told := await client.get("plant/@gateway/demo/lines/hall"))[0].json[
                     "trouble"
                 ]:
-                    pass  # a status document may be a fifth of a second old
+                    await asyncio.sleep(POLL)  # a status document may be a fifth of a second old
                 assert "in use by another program" in told[0].json["trouble"]
                 assert not first.has_said("line down")
 

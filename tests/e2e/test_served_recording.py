@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 
 from tests.e2e.processes import PATIENCE, free_port, gateway, started, write_config
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
 
 # Three reads of holding:7 and holding:8 of station 1, as `trace --record` writes them.
 LOG = """\
@@ -45,7 +45,7 @@ async def test_a_gateway_on_a_served_recording_gets_the_recorded_values(tmp_path
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 async with asyncio.timeout(PATIENCE):
                     while await values(client) != EXPECTED:
-                        pass
+                        await asyncio.sleep(POLL)
             assert reader.end() == 0
         assert plant.end() == 0
         assert plant.has_said("station-1: station 1, 2 addresses, 2 values in 0 s")

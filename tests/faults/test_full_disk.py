@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import forbidden, needs
 from tests.e2e.processes import Program, slowed, vigor_line, write_config
-from tests.zenoh_peer import Received, Subscription, ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, Received, Subscription, ZenohPeer, free_endpoint
 
 WITHIN = 2.0  # seconds from SIGTERM to the end
 SIZE = 8  # MB of the small disk
@@ -91,7 +91,7 @@ async def test_a_full_disk_is_reported_and_history_continues_with_room(
             ballast.unlink()
             await asyncio.to_thread(service.says, "history ready")
             while (now := await _history(client))["waiting"] > 40 or now["state"] != "ok":
-                pass  # two readings of twenty tags may be on their way
+                await asyncio.sleep(POLL)  # two readings of twenty tags may be on their way
             assert now["lost"] == 0
             await _is_remembered(client, heard)
             assert all(_good(sample) for sample in heard.samples)

@@ -14,7 +14,7 @@ import pytest
 
 from gateway.parts.registry import PARTS
 from tests.e2e.processes import PATIENCE, Program, free_port, write_config
-from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, Subscription, ZenohPeer, free_endpoint
 
 POLLED = 0.05  # seconds: a status document has no notice
 OWN, SET = "plant/@gateway/demo", "plant/mixer/recipe/@set"
@@ -98,7 +98,7 @@ class Running:
         await self.heard.next(lambda sample: bool(sample.json["quality"] == "good"), PATIENCE)
         async with asyncio.timeout(PATIENCE):
             while not all(one.ok for one in await self.client.get(SET, b"7", PATIENCE)):
-                pass  # a slow machine may refuse one: it stood still
+                await asyncio.sleep(POLL)  # a slow machine may refuse one: it stood still
         assert not self.program.has_said("THE LOOP IS HELD")
 
     async def document(self, path: str) -> dict[str, Any]:
