@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench scenarios peers plant reloads pictures pins crowd parsers contract docs clean sbom release bundle
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench scenarios peers plant reloads pictures pins crowd bridges parsers contract docs clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -167,6 +167,10 @@ operator: .venv/ready
 # Writes with faults, checked against what the PLC did.
 histories: .venv/ready
 	$(BIN)/python -m tests.faults.histories
+
+# Bridges, brokers and gateways killed at random; what their clients show (docs/contributors/bridges.md).
+bridges: .venv/ready
+	$(BIN)/python -m tests.bridges.campaign --hours $(HOURS) --seed $(SEED)
 
 # 10,000 connections to the page of a gateway that runs.
 crowd: .venv/ready
