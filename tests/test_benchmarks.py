@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scenario_clients, scenarios
+from benchmarks.bridges import DOORS
 from tests.conftest import lacking, needs
 from tests.e2e.processes import PATIENCE, ROOT
 
@@ -23,6 +24,11 @@ TINY = [
         "bus_use",
         "--seconds 0.3 --protocols vigor --bauds 115200",
         [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],
+    ),
+    (
+        "bridges",
+        "--tags 50 --rates 200 --seconds 0.2",
+        [rf"^\| {door} \| \d+ \| \d+ \| \d+% \| [\d.]+ s \| 0 \|$" for door in DOORS],
     ),
     ("commands", "--calls 1", [r"^\| `check` \| \d+ \|$", r"^\| `run` \| \d+ \|$"]),
     ("encodings", "", [r"^\| a value \| 68 \| 57 \(84%\) \|"]),

@@ -11,6 +11,8 @@ import zenoh
 
 from gateway.tags.timestamps import rfc3339
 
+_TEXTS = ("reason", "origin", "limited", "text")
+_EPOCH = 1970  # at its end: a zone may put its first hours before it
 Known = dict[str, Any]  # value, quality, time, and the reason of a bad value: docs/zenoh.md
 
 
@@ -51,7 +53,10 @@ def parsed(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known:
 def is_value(known: Any) -> bool:
     """Checks a document. Raises KeyError, TypeError or ValueError where a field lacks."""
     value, reason = known["value"], known.get("reason")
-    if datetime.fromisoformat(known["time"]).tzinfo is None:
+    time = datetime.fromisoformat(known["time"])
+    if time.tzinfo is None or time.year <= _EPOCH:
+        return False
+    if any(not isinstance(known.get(name, ""), str) for name in _TEXTS):
         return False
     if known["quality"] == "bad":
         return value is None and isinstance(reason, str)

@@ -35,7 +35,6 @@ DEVICES = ("a", "b", "c")
 TAGS: dict[str, dict[str, Any]] = {
     f"{device}/{tag}": {"type": "int32"} for device in DEVICES for tag in ("one", "two", "three")
 }
-EXPIRE = 20  # seconds
 LATE = 30.0  # seconds: keep-alive, lease, expiry
 AGAIN = 60.0  # seconds until all is right again
 
@@ -155,10 +154,10 @@ class InfluxServer:
 class Campaign:
     """One plant with its bridges. `broken`: sentences about what was shown and was not so."""
 
-    def __init__(self, folder: Path, seed: int) -> None:
+    def __init__(self, folder: Path, seed: int, expire: int = 20) -> None:
         self.done: Counter[str] = Counter()
         self.broken: list[str] = []
-        self._folder, self._random = folder, random.Random(seed)
+        self._folder, self._random, self._expire = folder, random.Random(seed), expire
         self._counter = 0
         self._truth = Truth()
         self._port, self._endpoint = free_port(), free_endpoint()
@@ -200,7 +199,7 @@ class Campaign:
             until(lambda: listens(self._port), "the broker listens")
             return
         options = {
-            "mqtt": ("mqtt", "--broker", broker, "--expire", EXPIRE),
+            "mqtt": ("mqtt", "--broker", broker, "--expire", self._expire),
             "sparkplug": ("mqtt", "--broker", broker, "--sparkplug", "g", "--node", "n"),
             "influx": (
                 *("influx", "--to", self._influx.url, "--every", 0.2),
@@ -212,9 +211,10 @@ class Campaign:
 
     def kill(self, name: str, by: signal.Signals = signal.SIGKILL) -> None:
         if program := self._programs.pop(name, None):
-            if "Traceback" in "\n".join(program.lines):
-                self.broken.append(f"{name} ended: {program.lines[-30:]}")
-            program.end(by)
+            if program.running:
+                program.end(by)
+            else:
+                self.broken.append(f"{name} ended by itself: {program.lines[-30:]}")
 
     # -- what happens --
 
@@ -286,6 +286,13 @@ class Campaign:
             self.judge()
             time.sleep(0.05)
         self._charts_are_old = False
+
+    def nothing_good(self) -> bool:
+        """Returns True if the clients of the broker show nothing as good."""
+        shown = self._shown()
+        return not any(
+            value is not None for name in ("mqtt", "sparkplug") for value in shown[name].values()
+        )
 
     def _lacking(self) -> list[str]:
         return [

@@ -3,9 +3,13 @@
 import json
 import re
 
+import pytest
+
+from gateway.bridges.documents import described_by, parsed
 from gateway.contract.documents.catalogue import FILE
 from gateway.contract.problems import Problem
 from gateway.tags import Reason
+from tests.bridges.played import META
 from tests.e2e.processes import ROOT
 
 OPCUA = ROOT / "gateway" / "bridges" / "opcua"
@@ -40,3 +44,35 @@ def test_every_outcome_of_a_write_has_the_code_of_the_page() -> None:
     assert {**known, "unclear": "BadTimeout"} == on_the_page("| status code of the write |")
     assert set(known) == {*Problem, "no-gateway"} - NOT_OF_WRITES - {Problem.UNCLEAR}
     assert "BadTimeout" not in known.values()
+
+
+@pytest.mark.parametrize(
+    "about",
+    [
+        {"time": "0001-01-01T00:00:00+14:00"},
+        {"time": "1970-01-01T00:00:00Z"},
+        {"time": "2026-01-01T00:00:00"},
+        {"reason": [1]},
+        {"origin": {"a": 1}},
+        {"limited": 5},
+        {"text": []},
+        {"quality": "great"},
+        {"quality": "uncertain"},
+        {"quality": "bad"},
+        {"value": None},
+        {"value": [1, "2"]},
+        {"value": {"a": 1}},
+    ],
+    ids=str,
+)
+def test_a_document_of_another_program_is_garbled(about: dict[str, object]) -> None:
+    known = {"value": 7, "quality": "good", "time": "2026-01-01T00:00:00Z"}
+    assert parsed(META, True, json.dumps(known).encode(), b"") == known
+    found = parsed(META, True, json.dumps(known | about).encode(), b"")
+    assert (found["value"], found["reason"]) == (None, "garbled")
+
+
+@pytest.mark.parametrize("payload", [b"\xff", b"[]", b"7", b'{"value": NaN}', b"9" * 5000, b""])
+def test_bytes_of_another_program_are_garbled(payload: bytes) -> None:
+    assert parsed(META, True, payload, b"")["reason"] == "garbled"
+    assert described_by("a/b", payload) is None
