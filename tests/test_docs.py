@@ -600,7 +600,7 @@ def test_every_key_in_the_pages_is_one_of_the_examples() -> None:
     shown = {
         (page, key)
         for page, text in TEXT.items()
-        if page != "integrate.md"  # topics of MQTT
+        if page not in ("bridges.md", "integrate.md")  # topics of MQTT
         for key in re.findall(r"(?<![\w/.-])plant/[^\s`\"'?,)}]+", text)
     }
     assert len(shown) >= 30

@@ -13,6 +13,8 @@ import zenoh
 
 from gateway.errors import ConfigError
 
+CANCEL_EVERY = 3.0  # seconds
+
 
 class Gateways(NamedTuple):
     """The gateways that a bridge serves: all below a prefix. `file`: a Zenoh file instead of
@@ -28,7 +30,7 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def extra(name: str) -> Iterator[None]:
+def packages_of(name: str) -> Iterator[None]:
     """Imports a bridge. Raises `ConfigError` where the packages of its extra are not installed."""
     try:
         yield
@@ -65,12 +67,21 @@ async def opened(gateways: Gateways) -> zenoh.Session:
 
 
 def run(bridge: Coroutine[Any, Any, None]) -> None:
-    """Runs it until Ctrl-C or SIGTERM, which cancel it."""
+    """Runs it until Ctrl-C or SIGTERM, which cancel it.
+
+    Again after a pause: `asyncio.wait_for` of Python 3.11 may lose a cancellation, and libraries
+    use it.
+    """
 
     async def until_signal() -> None:
-        task = asyncio.ensure_future(bridge)
+        task, loop = asyncio.ensure_future(bridge), asyncio.get_running_loop()
+
+        def stop() -> None:
+            task.cancel()
+            loop.call_later(CANCEL_EVERY, stop)
+
         with suppress(NotImplementedError):  # Windows
-            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+            loop.add_signal_handler(signal.SIGTERM, stop)
         await task
 
     with suppress(KeyboardInterrupt, asyncio.CancelledError):

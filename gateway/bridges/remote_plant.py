@@ -138,7 +138,8 @@ class RemotePlant:
                 continue
             pause = QUERY_EVERY if query.result() else min(2 * pause, QUERY_EVERY)
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._query_due.wait(), pause)
+                async with asyncio.timeout(pause):
+                    await self._query_due.wait()
                 pause = RETRY_AFTER
 
     async def _describe(self) -> None:

@@ -170,7 +170,8 @@ class Bridge:
             again = time.monotonic() + self._expire / 3
             while (left := again - time.monotonic()) > 0:
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._news.wait(), left)
+                    async with asyncio.timeout(left):
+                        await self._news.wait()
                 self._news.clear()
                 await self._publish(broker)
             self._repeats = dict.fromkeys(self._retained, 0.0)

@@ -74,7 +74,8 @@ class Alarms:
                 if (sample := reply.ok) is not None:
                     self._sample(str(sample.key_expr), True, sample.payload.to_bytes(), b"")
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._due.wait(), QUERY_EVERY)
+                async with asyncio.timeout(QUERY_EVERY):
+                    await self._due.wait()
 
     async def serve(self) -> None:
         """Passes the events on to the clients."""

@@ -112,7 +112,8 @@ class SparkplugBridge:
                         await self._publish(broker, is_birth=not is_born)
                         is_born = True
                     with suppress(TimeoutError):
-                        await asyncio.wait_for(self._news.wait(), LOOK_EVERY)
+                        async with asyncio.timeout(LOOK_EVERY):
+                            await self._news.wait()
                         await asyncio.sleep(GATHER)
                     self._news.clear()
                 say(f"the host {self._host.name} is offline")
