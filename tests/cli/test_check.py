@@ -1,5 +1,6 @@
 """The `check` command."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -164,3 +165,33 @@ def test_check_says_how_long_a_connection_takes(command: Command, tmp_path: Path
     done = command("check", write_config(tmp_path / "c.yaml", free_endpoint(), lines))
     text = " ".join(done.out.split())
     assert "line far connects for each round and each write: each takes 1.5 s longer" in text
+
+
+@pytest.mark.parametrize(
+    ("ports", "warned"),
+    [
+        (("/dev/ttyUSB0", "/dev/ttyACM0"), True),
+        (("/dev/ttyUSB0", "/dev/ttyS0"), False),  # one adapter keeps its number
+        (("/dev/serial/by-id/usb-a", "/dev/serial/by-path/pci-1"), False),
+    ],
+)
+def test_check_warns_of_adapters_that_may_change_places(
+    command: Command, tmp_path: Path, ports: tuple[str, str], warned: bool
+) -> None:
+    lines = {
+        f"hall-{number}": {
+            "port": port,
+            "devices": {
+                f"press-{number}": {
+                    "protocol": "modbus-rtu",
+                    "station": 1,
+                    "tags": {"t": {"address": "holding:0"}},
+                }
+            },
+        }
+        for number, port in enumerate(ports)
+    }
+    file = tmp_path / "plant.yaml"
+    file.write_text(json.dumps({"lines": lines}))
+    said = " ".join(command("check", file).err.split())
+    assert ("hall-0 and hall-1: /dev/ttyUSB0 and /dev/ttyACM0 may change places" in said) is warned

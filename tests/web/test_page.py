@@ -10,6 +10,7 @@ import aiohttp
 import pytest
 from aiohttp import web
 
+from gateway.contract.problems import Failure, Problem
 from gateway.tags import AlarmRule, Level, Reason, WriteResult, WriteRule, bad, good
 from tests.conftest import needs
 from tests.e2e.processes import free_port
@@ -120,6 +121,39 @@ async def test_one_search_finds_tags_and_devices(tab: Tab) -> None:
         await tab.value('document.getElementById("find").focus()')
         await tab.press("Escape")
         await tab.until(f"{text('#tags-title')} === '4 tags'")
+
+
+async def test_a_program_at_a_door_is_disconnected_after_a_second_click(
+    tab: Tab, tokens: Path
+) -> None:
+    door = {"line": "hall", "listen": "0.0.0.0:1503", "protocol": "raw", "trouble": "", "most": 0.3}
+    door |= {"share": 0.25, "turned_away": 0, "reads": []}
+    program = {"address": "10.1.0.7", "since": 300.0, "requests": 0, "writes": 0, "refused": 0}
+    button, listed = '[aria-label="disconnect the programs of ladder"]', text("#lines-list")
+    async with serving(plant=oven(), tokens_file=tokens) as client:
+        client.north.changed = {
+            "doors/ladder": {**door, "programs": [{**program, "unanswered": 0}]}
+        }
+        client.north.endings[RELEASE] = Failure(Problem.BUSY, "this gateway is the standby")
+        await opened(tab, client, "lines")
+        await tab.until(f"{listed}.includes('door ladder, 25 % of the wire: 10.1.0.7')")
+        await tab.click(button)
+        await sign_in(tab)
+        await tab.until(f"{text(button)} === 'Confirm: disconnect'")
+        assert client.north.written == []
+        await tab.click(button)
+        await tab.until(f"{listed}.includes('door ladder: this gateway is the standby')")
+        client.north.orders = released
+        await tab.click(button)
+        await tab.until(f"{listed}.includes('door ladder: disconnected')")
+        assert client.north.written == [("ladder", RELEASE, "web alice")] * 2
+
+
+RELEASE = b'{"do": "release"}'
+
+
+async def released(_path: str, _data: bytes, _by: str | None) -> bytes:
+    return b"{}"
 
 
 async def test_an_alarm_is_acknowledged_and_a_value_written_after_one_sign_in(

@@ -1,6 +1,7 @@
 """The `check` command: validates the file and prints the plan of each line."""
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -29,7 +30,10 @@ from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.capabilities import ChangesBits
 from gateway.tags.tag import CounterRule
-from gateway.transport.port import ListenAddress
+from gateway.transport.port import ListenAddress, SerialPath
+
+# The system counts adapters in the order in which it finds them.
+_COUNTED = re.compile(r"/dev/tty(USB|ACM)[0-9]+\Z")
 
 
 def check(
@@ -54,6 +58,7 @@ def check(
     with progress(err) as report:
         loaded = load(config, report)
         warnings = zenoh_warnings(loaded) + exposure.check(loaded) + _open_to_all(loaded)
+        warnings += _may_change_places(loaded)
         lines = forecasts(loaded, report)
     warnings += [*door_warnings(loaded, lines), *_too_large(loaded)]
     by_name = {line.name: line for line in loaded.lines}
@@ -126,6 +131,22 @@ def _without_polls(config: Config) -> Iterator[RenderableType]:
             f"{_counted(len(tags), 'tag')} can be learned, when another master reads them"
         )
         yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
+
+
+def _may_change_places(config: Config) -> list[str]:
+    """Returns a warning if adapters have names in the order in which the system found them: a
+    line could then show the values of another one."""
+    ports = {line.name: line.port for line in config.lines}
+    found = {name: port.path for name, port in ports.items() if isinstance(port, SerialPath)}
+    counted = {name: path for name, path in found.items() if _COUNTED.match(path)}
+    if len(counted) < 2:
+        return []
+    (one, first), (other, second), *_ = counted.items()
+    text = f"lines {one} and {other}: {first} and {second} may change places after a restart, and "
+    text += (
+        "each line then asks the devices of the other; write their names in /dev/serial/by-id/, "
+    )
+    return [f"{text}or in /dev/serial/by-path/ for adapters without a serial number"]
 
 
 def _open_to_all(config: Config) -> list[str]:
