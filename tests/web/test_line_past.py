@@ -49,7 +49,7 @@ def test_a_state_is_noted_once_with_its_cause_and_without_its_figures(loads: Loa
 
 def test_a_silent_line_that_is_opened_again_is_not_well_meanwhile(loads: Loads) -> None:
     starts = {"devices": {"mixer": "up", "oven": "starting"}}
-    loads.note(documents(starts, standing="starting", diagnosis=""), 0)
+    loads.note(documents({"open": False, "trouble": ""}), 0)
     assert loads.timelines["hall"] == ((0, "starting", ""),)
     for at in (1, 3):
         loads.note(documents({}), at)

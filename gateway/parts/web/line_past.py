@@ -72,8 +72,10 @@ class Loads:
             kind = "wrong" if faults else "warning" if warnings else "well"
             cause = _CHANGING.sub("", next(iter([*faults, *warnings]), ""))[:_LONGEST]
             states = known.get(name, ())
-            if kind == "well" and "starting" in documents[f"lines/{name}"]["devices"].values():
-                kind = "starting"
+            line = documents[f"lines/{name}"]
+            opens = not line["open"] and not line["trouble"]
+            if opens or (kind == "well" and "starting" in line["devices"].values()):
+                kind, cause = "starting", ""
             if not states or (kind != "starting" and states[-1][1:] != (kind, cause)):
                 states = (*states[1 - KEPT_STATES :], (now, kind, cause))
             self.timelines[name] = states
