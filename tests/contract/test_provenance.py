@@ -11,6 +11,8 @@ import pytest
 from gateway.bridges.documents import is_value
 from gateway.bridges.influx.lines import line_of
 from gateway.bridges.mqtt.bridge import Bridge
+from gateway.bridges.mqtt.sparkplug.messages import Payload
+from gateway.bridges.mqtt.sparkplug.metrics import fill
 from gateway.bridges.opcua.values import Code, data_value, type_of
 from gateway.cli.history.history import _SAMPLES, _row  # a line of a CSV file, without the file
 from gateway.cli.tables import row_of, table_of
@@ -91,6 +93,7 @@ def shown(sample: Sample, folder: Path) -> dict[str, str]:
         "page": _of_page(sample),
         "CSV": _about(dict(zip(names, _row(past), strict=True))),
         "MQTT": _about(_of_mqtt(tag, known)),
+        "Sparkplug B": _of_sparkplug(tag, known),
         "OPC UA": _of_opcua(tag, known),
         "InfluxDB": ", ".join(
             part.replace('"', "").replace("=", ": ")
@@ -127,6 +130,15 @@ def _of_mqtt(tag: Tag, known: dict[str, Any]) -> Any:
     bridge.changed(tag.key, known)
     [document] = bridge._retained.values()  # what the broker would get
     return json.loads(document)
+
+
+def _of_sparkplug(tag: Tag, known: dict[str, Any]) -> str:
+    metric = Payload().metrics.add()
+    fill(metric, known, meta_fields(tag))
+    found = dict(zip(metric.properties.keys, metric.properties.values, strict=True))
+    quality = found.pop("Quality").int_value
+    about = [f"{name}: {one.string_value}" for name, one in found.items() if name != "Reason"]
+    return ", ".join([*about, *([] if quality == 192 else [f"quality {quality}"])])
 
 
 def _about(document: dict[str, Any]) -> str:
