@@ -10,7 +10,7 @@ from asyncua.server.address_space import AddressSpace, ViewService
 
 Code = ua.StatusCodes
 MOST_REFERENCES = 2_000  # of one node in one answer
-MOST_IN_ANSWER = 20_000
+MOST_IN_ANSWER = 5_000
 MOST_POINTS = 20  # continuation points of one session
 _NULL = ua.NodeId(ua.ObjectIds.Null)
 

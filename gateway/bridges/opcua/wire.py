@@ -37,6 +37,7 @@ UNREAD = 30.0  # seconds that a client may leave its answers unread
 _KINDS = b"HEL", b"OPN", b"MSG", b"CLO", b"ERR"
 PENDING = 50  # requests of one connection that wait before it is read no further
 MOST_SLOW = 20  # writes and reads of the history of one connection at once
+MOST_REST = 0.2  # seconds that a connection waits after a request that took long
 MOST_PUBLISH = 30  # publish requests that wait
 
 
@@ -230,20 +231,22 @@ class Connection(OPCUAProtocol):
         self._writable.set()
 
     async def _process_one_msg(self, header: ua.Header, buf: Buffer) -> bool:
-        done = False
+        done, time = False, asyncio.get_running_loop().time
         try:
             async with asyncio.timeout(UNREAD):
                 await self._writable.wait()
+            begun = time()
             done = await super()._process_one_msg(header, buf)
         except TimeoutError:
             self.abort()
+            return False
         finally:
             if not done and self.transport is not None:
                 self.transport.close()
         if self.messages.empty() and self.transport is not None:
             with suppress(RuntimeError):  # it is closing
                 self.transport.resume_reading()
-        await asyncio.sleep(0)  # the other connections have their turn
+        await asyncio.sleep(min(time() - begun, MOST_REST))  # half of the time is of the others
         return done
 
     def is_idle(self, now: float) -> bool:
