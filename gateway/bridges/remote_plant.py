@@ -45,6 +45,7 @@ class RemotePlant:
         self._described, self._changed = described, changed
         self._query_due, self._arrived = asyncio.Event(), asyncio.Event()
         self._presence = Presence()
+        self._loaded: dict[str, object] = {}  # when each gateway took its file, by key
         self._live: set[str] = set()  # keys that changed after the last query began
         inbox = Inbox(self._query_due.set)  # a query instead of the lost values
         token = inbox.callback(self._token, always=True)
@@ -52,6 +53,7 @@ class RemotePlant:
         self._declared = [
             session.declare_subscriber(f"{prefix}/**", inbox.callback(self._sample)),
             session.declare_subscriber(f"{prefix}/*/@block", inbox.callback(self._block)),
+            session.declare_subscriber(f"{own}/reload", inbox.callback(self._reloaded)),
             live.declare_subscriber(own, token, history=True),
             live.declare_subscriber(f"{own}/alive/*", token, history=True),
         ]
@@ -82,6 +84,14 @@ class RemotePlant:
         self._query_due.set()
         if there:
             self._arrived.set()
+
+    def _reloaded(self, key: str, _is_put: bool, payload: bytes, _about: bytes) -> None:
+        """Queries all again after a gateway has taken a changed file."""
+        with suppress(ValueError, KeyError, TypeError):
+            loaded = orjson.loads(payload)["loaded"]
+            if self._loaded.get(key, loaded) != loaded:
+                self._query_due.set()
+            self._loaded[key] = loaded
 
     def _gone(self, gateway: str, device: str, reason: str) -> None:
         if not self._presence.is_lost(gateway, device):
