@@ -1,11 +1,9 @@
 """The devices of an FX and their byte addresses for the commands 0, 1, 7 and 8."""
 
-from functools import lru_cache
-
+from gateway.protocols.byte_addresses import covering
 from gateway.protocols.devices import device_table
 from gateway.protocols.driver import Area, Span, Unit
 from gateway.protocols.fx.codec import MOST_BYTES
-from gateway.protocols.vigor.devices import Cover
 
 # Area, and the byte address of its first device.
 _PLACES = (
@@ -24,25 +22,8 @@ _PLACES = (
 )
 AREAS = {area.name: area for area, _ in _PLACES}
 _BASES = {area.name: base for area, base in _PLACES}
-_WIDTH = {Unit.WORD: 2, Unit.DWORD: 4}  # bytes
 DEVICES = device_table(AREAS.values(), TN="T", CN="C")
-
-
-@lru_cache(maxsize=4096)
-def cover(span: Span) -> Cover | None:
-    """Returns the bytes that hold `span`; None for too many, or a span outside its area."""
-    area = AREAS.get(span.area)
-    if area is None or not area.holds(span):
-        return None
-    offset, base = span.start - area.first, _BASES[area.name]
-    if area.unit is Unit.BIT:
-        ahead = offset % 8
-        size = (ahead + span.size + 7) // 8
-        found = Cover(base + offset // 8, size, ahead, 8 * size - ahead - span.size)
-    else:
-        width = _WIDTH[area.unit]
-        found = Cover(base + width * offset, width * span.size, 0, 0)
-    return found if found.size <= MOST_BYTES else None
+cover = covering(_PLACES, MOST_BYTES)
 
 
 def bit_address(span: Span) -> bytes:

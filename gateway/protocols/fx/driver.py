@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
+from gateway.protocols.byte_addresses import Cover, bits_from_bytes, bytes_from_bits
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.fx.codec import (
@@ -21,7 +22,6 @@ from gateway.protocols.fx.codec import (
 )
 from gateway.protocols.fx.devices import AREAS, DEVICES, bit_address, cover
 from gateway.protocols.harmless import odd_reads, resync_by_reads
-from gateway.protocols.vigor.devices import Cover, bits_from_bytes, bytes_from_bits
 
 _REQUEST = AROUND + 7  # command, address and number of bytes
 _ACKNOWLEDGED: Hashable = "ack"
@@ -63,11 +63,7 @@ class Fx:
             return None
         if _forced(span):
             return _FORCE_COST
-        write = Cost(_REQUEST + 2 * covered.size, 1)
-        if not covered.ahead and not covered.behind:
-            return write
-        read = _read_cost(covered)
-        return Cost(read.request + write.request, read.reply + write.reply)
+        return covered.write_cost(_read_cost(covered), Cost(_REQUEST + 2 * covered.size, 1))
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
         """Returns the units of `span`. Raises `ConfigError` for a span without `cost`."""

@@ -1,12 +1,8 @@
 """The devices of a Vigor PLC and their byte addresses (manual B-5-3)."""
 
-from collections.abc import Sequence
-from functools import lru_cache
-from itertools import chain
-from typing import NamedTuple
-
+from gateway.protocols.byte_addresses import covering
 from gateway.protocols.devices import device_table
-from gateway.protocols.driver import Area, Span, Unit
+from gateway.protocols.driver import Area, Unit
 from gateway.protocols.vigor.codec import MOST_BYTES
 
 # Area, and the byte address of its first device.
@@ -34,52 +30,9 @@ FORCIBLE = frozenset({"X", "Y", "M", "S", "M9"})
 
 # M and D continue at 9000, after a gap.
 DEVICES = device_table(AREAS.values(), TN="T", CN="C")
-
-
-class Cover(NamedTuple):
-    """The bytes of one request for a span."""
-
-    address: int
-    size: int
-    ahead: int  # bits before the span in its first byte
-    behind: int  # bits after it in its last
-
-
-@lru_cache(maxsize=4096)
-def cover(span: Span) -> Cover | None:
-    """Returns the bytes that hold `span`; None for too many, or a span outside its area."""
-    area = AREAS.get(span.area)
-    if area is None or not area.holds(span):
-        return None
-    offset, base = span.start - area.first, _BASES[area.name]
-    match area.unit:
-        case Unit.BIT:
-            ahead = offset % 8
-            count = (ahead + span.size + 7) // 8
-            found = Cover(base + offset // 8, count, ahead, 8 * count - ahead - span.size)
-        case Unit.WORD:
-            found = Cover(base + 2 * offset, 2 * span.size, 0, 0)
-        case Unit.DWORD:
-            found = Cover(base + 4 * offset, 4 * span.size, 0, 0)
-    return found if found.size <= MOST_BYTES else None
+cover = covering(_PLACES, MOST_BYTES)
 
 
 def bit_address(area: str, number: int) -> int:
     """Returns the address of a bit for 70 and 71: byte address times eight, plus its place."""
     return 8 * _BASES[area] + number - AREAS[area].first
-
-
-_BITS = tuple(tuple(byte >> place & 1 for place in range(8)) for byte in range(256))
-
-
-def bits_from_bytes(data: bytes) -> list[int]:
-    """Returns eight bits of each byte, the lowest device first."""
-    return list(chain.from_iterable(map(_BITS.__getitem__, data)))
-
-
-def bytes_from_bits(bits: Sequence[int]) -> bytes:
-    """The inverse, for whole bytes of bits."""
-    return bytes(
-        sum(bit << place for place, bit in enumerate(bits[at : at + 8]))
-        for at in range(0, len(bits), 8)
-    )

@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import ClassVar, Literal
 
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
+from gateway.protocols.byte_addresses import Cover, bits_from_bytes, bytes_from_bits
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Cost, Span, Talk, Timing, Traits, Unit
@@ -25,16 +26,7 @@ from gateway.protocols.vigor.codec import (
     Request,
     VigorCodec,
 )
-from gateway.protocols.vigor.devices import (
-    AREAS,
-    DEVICES,
-    FORCIBLE,
-    Cover,
-    bit_address,
-    bits_from_bytes,
-    bytes_from_bits,
-    cover,
-)
+from gateway.protocols.vigor.devices import AREAS, DEVICES, FORCIBLE, bit_address, cover
 from gateway.protocols.vigor.traffic import vigor_traffic_reader
 
 # Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
@@ -104,10 +96,7 @@ class Vigor:
         if _forced(span):
             return Cost(_FORCE_REQUEST, SHORT_REPLY)
         write = Cost(_BLOCK_REQUEST + 2 * covered.size, SHORT_REPLY)
-        if not covered.ahead and not covered.behind:
-            return write
-        read = _read_cost(covered)
-        return Cost(read.request + write.request, read.reply + write.reply)
+        return covered.write_cost(_read_cost(covered), write)
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
         """Returns the units of `span`. Raises `ConfigError` for a span without `cost`."""
