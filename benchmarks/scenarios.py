@@ -37,6 +37,7 @@ SETTLE = 6.0
 DRAIN = 1.5  # seconds after it, for what is still on its way
 PATIENCE = 180.0  # seconds for the first values
 QUIET = 0.1  # cores that other programs may use in a quiet run
+TREE = Path(os.environ.get("GATEWAY_TREE", HERE))  # another checkout, to compare
 TICKS = os.sysconf("SC_CLK_TCK")
 BEGIN, END = "<!-- scenarios -->", "<!-- end of scenarios -->"
 
@@ -71,7 +72,10 @@ SCENARIOS = {
     "fast": Scenario(10, 10, 100, every=0.1),
     "one": Scenario(1, 1, 1000),
     "rtu": Scenario(64, 4, 50, baud=19200),
+    "over": Scenario(10, 10, 1000, every=0.5),
+    "blocks": Scenario(10, 10, 1000, blocks="only"),
 }
+CHANGING_ONLY = {SCENARIOS["over"], SCENARIOS["blocks"]}
 
 
 def file(scenario: Scenario, endpoint: str, port: int) -> Iterator[str]:
@@ -110,17 +114,15 @@ def compiled(folder: Path) -> Path:
 class Program:
     """A process that speaks lines, and its use of the machine."""
 
-    def __init__(
-        self, *command: object, env: dict[str, str] | None = None, log: Any = None
-    ) -> None:
+    def __init__(self, *command: object, tree: Path = HERE, log: Any = None) -> None:
         self.process = subprocess.Popen(
             [str(word) for word in command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
-            cwd=HERE,
-            env=env,
+            cwd=tree,
+            env={**os.environ, "PYTHONPATH": str(tree)},
         )
 
     def line(self) -> str:
@@ -213,9 +215,7 @@ def running(scenario: Scenario, *, changing: bool, slave: Path) -> Iterator[dict
         assert slaves.line() == "ready"
         begun = time.monotonic()
         log = stack.enter_context((folder / "log").open("w"))
-        tree = os.environ.get("GATEWAY_TREE", str(HERE))  # another checkout, to compare
-        known = {**os.environ, "PYTHONPATH": tree}
-        gateway = Program(sys.executable, "-m", "gateway", "run", path, env=known, log=log)
+        gateway = Program(sys.executable, "-m", "gateway", "run", path, tree=TREE, log=log)
         stack.callback(gateway.stop)
         while not listens(endpoint):
             if gateway.process.poll() is not None:
@@ -276,7 +276,8 @@ def measured(
         begin, load, before = time.monotonic(), Load(), sum(one.used() for one in own)
         spent, by_thread = gateway.used(), threads(gateway.process.pid)
         if spy:
-            spied = ["py-spy", "record", "-g", "-d", str(int(seconds)), "-p"]
+            form = ["-f", "raw"] if spy.endswith(".txt") else []
+            spied = ["py-spy", "record", *form, "-g", "-r", "300", "-d", str(int(seconds)), "-p"]
             subprocess.run([*spied, str(gateway.process.pid), "-o", spy], check=True)
         time.sleep(max(0.0, begin + seconds - time.monotonic()))
         end = time.monotonic()
@@ -400,14 +401,17 @@ def main() -> None:
     if arguments.sizes is not None:
         lines, units, tags, every = arguments.sizes
         chosen = [Scenario(int(lines), int(units), int(tags), every)]
-    chosen = [one._replace(kind=arguments.kind, blocks=arguments.blocks) for one in chosen]
+    if arguments.kind != "uint32":
+        chosen = [one._replace(kind=arguments.kind) for one in chosen]
+    if arguments.blocks != "false":
+        chosen = [one._replace(blocks=arguments.blocks) for one in chosen]
     changes = {"stay": [False], "change": [True], "both": [False, True]}[arguments.values]
     times = Times(arguments.seconds, arguments.rate, arguments.settle)
     results: dict[str, Any] = {"machine": machine(), "scenarios": []}
     with tempfile.TemporaryDirectory() as folder:
         slave = compiled(Path(folder))
         for scenario in chosen:
-            for changing in changes:
+            for changing in [True] if scenario in CHANGING_ONLY else changes:
                 one = measured(
                     scenario, changing=changing, slave=slave, times=times, spy=arguments.spy
                 )

@@ -125,23 +125,24 @@ def value(sample: Sample) -> bytes:
     return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time, origin, limited))
 
 
+def plain_value(known: Value, time: int) -> bytes | None:
+    """The good value of a plain tag, with quality and time. None: JSON has no such value."""
+    text = orjson.dumps(known)
+    return None if text == b"null" else b'{"value":%b%b' % (text, _end_of_good(time, None, None))
+
+
 @lru_cache(maxsize=256)  # the samples of one scan share one time
 def _end_of_good(time: int, origin: str | None, limited: str | None) -> bytes:
-    known = "" if origin is None else f',"origin":"{origin}"'
-    known += "" if limited is None else f',"limited":"{limited}"'
+    named = (("origin", origin), ("limited", limited))
+    known = "".join(f',"{name}":"{word}"' for name, word in named if word is not None)
     return f',"quality":"good","time":"{rfc3339(time)}"{known}}}'.encode()
 
 
 def value_text(sample: Sample) -> bytes | None:
     """The value alone, as text; None if it is unknown. `attachment` holds the rest."""
-    known = sample_fields(sample)["value"]
-    match known:
-        case None:
-            return None
-        case str():
-            return known.encode()
-        case _:
-            return orjson.dumps(known)
+    if (known := sample_fields(sample)["value"]) is None:
+        return None
+    return known.encode() if isinstance(known, str) else orjson.dumps(known)
 
 
 def attachment(sample: Sample) -> bytes:

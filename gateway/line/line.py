@@ -7,7 +7,6 @@ back; the engine's effects go to the clients, the sample sink and the log.
 import asyncio
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any, Protocol
 
 import structlog
@@ -344,9 +343,13 @@ class Line:
     async def idle(self, until: float) -> None:
         """Waits until then, or for a request or bytes."""
         self._wake.clear()
-        with suppress(TimeoutError):
-            async with asyncio.timeout_at(None if until == NEVER else until):
-                await self._wake.wait()
+        loop, wake = asyncio.get_running_loop(), self._wake.set
+        timer = None if until == NEVER else loop.call_at(until, wake)  # cheaper than a time-out
+        try:
+            await self._wake.wait()
+        finally:
+            if timer is not None:
+                timer.cancel()
 
     # Effects
 

@@ -14,7 +14,8 @@ from gateway.protocols.driver import Cost, Span, Unit
 from gateway.protocols.models import Model
 
 LONG_ROW = 300  # items of one area
-LONGEST_KEPT = 500  # items of a row whose requests are remembered
+LONGEST_KEPT = 500  # items of a row whose requests are remembered; of longer rows, of the last few
+LONGEST = 10_000
 Seconds = Callable[[Cost], float]  # of a transaction; equal ones give equal results
 
 
@@ -33,13 +34,14 @@ def requests_of(row: AreaItems, model: Model, seconds: Seconds) -> Sequence[Requ
 
     Raises `ValueError` with the index of an item that fits no request.
     """
-    if len(row.starts) > LONGEST_KEPT:
+    if len(row.starts) > LONGEST:
         return cover(row, model, seconds)
     if _of_words(row, model):
         by = model.driver.areas[row.area].first - row.starts[0]
         starts = tuple([start + by for start in row.starts])
         row = row._replace(starts=starts, ends=tuple([end + by for end in row.ends]))
-    return _remembered(row, model, seconds)
+    remembered = _remembered if len(row.starts) <= LONGEST_KEPT else _last_few
+    return remembered(row, model, seconds)
 
 
 def cover(row: AreaItems, model: Model, seconds: Seconds) -> tuple[Request, ...]:
@@ -73,9 +75,8 @@ def _of_words(row: AreaItems, model: Model) -> bool:
     return inside and area.unit is not Unit.BIT
 
 
-@lru_cache(maxsize=1024)
-def _remembered(row: AreaItems, model: Model, seconds: Seconds) -> tuple[Request, ...]:
-    return cover(row, model, seconds)
+_remembered = lru_cache(maxsize=1024)(cover)
+_last_few = lru_cache(maxsize=4)(cover)
 
 
 @lru_cache(maxsize=64)

@@ -11,7 +11,7 @@ from gateway.errors import Garbled
 from gateway.protocols.driver import Unit
 from gateway.tags.scaling import Linear, scaled, scaled_float
 from gateway.tags.shaping import Shaping, shaped
-from gateway.values import BYTES, Byte, Layout, Value, from_word, from_words
+from gateway.values import BYTES, Byte, Layout, Value, from_number, from_word, from_words
 from gateway.values.numerals import Scalar
 
 Decode = Callable[[Any], Value | None]
@@ -124,6 +124,13 @@ def array_decoder(element: Decode, size: int) -> Decode:
         return None if None in found else found
 
     return values
+
+
+@lru_cache(maxsize=4096)
+def number_decoder(layout: Layout, line: Linear | None, shaping: Shaping) -> DecodeOne:
+    """Returns the function from a number, as the device holds it, to the value. `index` if they
+    are the same."""
+    return with_shaping(_scaled(from_number(layout.type.kind), layout, line), shaping)
 
 
 @lru_cache(maxsize=4096)

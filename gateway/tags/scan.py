@@ -1,11 +1,13 @@
 """Decodes the reads of a block: only what changed, and makes samples only where they are needed."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from copy import copy
 from itertools import compress
 from operator import call, itemgetter, ne
 from typing import Any, overload
 
 from gateway.tags.alarm import AlarmRule
+from gateway.tags.numbers import numbers
 from gateway.tags.publishing import Publish
 from gateway.tags.sample import Quality, Reason, Sample, bad, of_field, uncertain
 from gateway.tags.tag import Tag
@@ -24,7 +26,7 @@ class Latest:
     next read of the block is then compared with nothing.
     """
 
-    __slots__ = ("alarmed", "by_rule", "in_use", "scan", "superseded", "unasked")
+    __slots__ = ("alarmed", "by_rule", "in_use", "named", "scan", "superseded", "unasked")
 
     def __init__(self) -> None:
         self.scan: Scan
@@ -33,6 +35,7 @@ class Latest:
         self.by_rule: Collection[int] = ()  # places of tags with a deadband, a heartbeat ...
         self.unasked: Collection[int] = ()  # of these, tags that are published without a change
         self.alarmed: Collection[int] | None = None  # places of tags with an alarm; None: not known
+        self.named: frozenset[int] = _NOWHERE  # places whose documents have more than a value
 
     def adopt(self, scan: "Scan") -> None:
         """Begins with a scan."""
@@ -42,18 +45,19 @@ class Latest:
         self.by_rule = frozenset(eager).union(p for p, rule in rules if rule.deadband is not None)
         self.unasked = tuple(eager)
         self.alarmed = tuple(p for p, tag in places if tag.feature(AlarmRule) is not None)
+        self.named = frozenset(p for p, tag in places if not tag.is_plain)
         self.scan, self.in_use = scan, True
 
 
 class Samples(Sequence[Sample]):
     """The samples of some places of a read. They are made when the first one is taken."""
 
-    __slots__ = ("_failures", "_made", "_outside", "_places", "_tags", "_time", "_values")
+    __slots__ = ("_failures", "_made", "_named", "_outside", "_places", "_tags", "_values", "time")
 
     def __init__(self, scan: "Scan", places: Sequence[int]) -> None:
         self._tags, self._values, self._failures = scan.tags, scan.values, scan.failures
-        self._time = scan.time  # an equal read moves that of the scan
-        self._outside = scan.outside
+        self.time = scan.time  # an equal read moves that of the scan
+        self._outside, self._named = scan.outside, scan.latest.named
         self._places = places
         self._made: list[Sample] | None = None
 
@@ -70,9 +74,34 @@ class Samples(Sequence[Sample]):
     def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
         return self._all()[index]
 
+    @property
+    def block(self) -> int:
+        """A number of the block, while this is kept."""
+        return id(self._tags)
+
+    @property
+    def tags(self) -> list[Tag]:
+        return [self._tags[place] for place in self._places]
+
+    def parts(self) -> Iterator[Value | Sample]:
+        """Yields the good value of each tag that has a plain one, and the sample of others."""
+        values, special = self._values, self._named
+        if self._failures or self._outside:
+            special = special.union(self._failures, self._outside)
+        for number, place in enumerate(self._places):
+            value = values[place]
+            yield self[number] if value is None or place in special else value
+
+    def without(self, gone: Collection[Tag]) -> "Samples":
+        """Returns the same samples without those of some tags."""
+        rest = copy(self)
+        rest._places = [place for place in self._places if self._tags[place] not in gone]
+        rest._made = None
+        return rest
+
     def _all(self) -> list[Sample]:
         if self._made is None:
-            tags, values, time = self._tags, self._values, self._time
+            tags, values, time = self._tags, self._values, self.time
             good, new = Quality.GOOD, tuple.__new__  # twice as fast as the constructor
             self._made = [
                 self._failures[place]
@@ -140,7 +169,7 @@ class Scan(Sequence[Sample]):
 class Decoder:
     """Makes the scans of one block."""
 
-    __slots__ = ("_begins", "_checks", "_convert", "_keys", "_places", "_tags")
+    __slots__ = ("_begins", "_checks", "_convert", "_keys", "_places", "_plain", "_tags")
 
     def __init__(self, tags: Sequence[Tag], begins: Sequence[int]) -> None:
         """`begins`: for each tag the place of its first unit in the reply."""
@@ -150,6 +179,14 @@ class Decoder:
         self._convert = tuple(tag.convert for tag in tags)
         checks = ((place, tag.range_check()) for place, tag in enumerate(tags))
         self._checks = [(place, check) for place, check in checks if check is not None]
+        self._keys: Callable[[Sequence[Any]], Sequence[Any]]
+        self._plain = False  # the keys are the values
+        found = None if self._checks else numbers(tags, begins)
+        if found is not None:
+            self._keys, converts = found
+            self._plain = converts is None
+            self._convert = () if converts is None else tuple(converts)
+            return
         self._keys = itemgetter(
             *(
                 begin if tag.single else slice(begin, begin + tag.span.size)
@@ -161,6 +198,8 @@ class Decoder:
     def first(self, units: Sequence[Any], time: int) -> Scan:
         """Decodes all units; `time` is the arrival of the reply (ns since 1970)."""
         keys = self._keys(units)
+        if self._plain:
+            return Scan(self._tags, units, keys, keys, NO_FAILURES, time, Latest())
         values = list(map(call, self._convert, keys))
         failures = self._failures(values, NO_FAILURES, time)
         return self._checked(Scan(self._tags, units, keys, values, failures, time, Latest()))
@@ -168,6 +207,8 @@ class Decoder:
     def after(self, before: Scan, units: Sequence[Any], time: int) -> Scan:
         """Decodes the units that are not those of the read before."""
         keys, convert = self._keys(units), self._convert
+        if self._plain:
+            return Scan(self._tags, units, keys, keys, NO_FAILURES, time, before.latest)
         changed = list(map(ne, keys, before.keys))
         new = list(map(call, compress(convert, changed), compress(keys, changed)))
         failures = before.failures

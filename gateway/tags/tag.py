@@ -17,7 +17,7 @@ from gateway.tags.decoding import (
     with_shaping,
 )
 from gateway.tags.formula import Formula
-from gateway.tags.publishing import ON_CHANGE, Publishing
+from gateway.tags.publishing import ON_CHANGE, Form, Publishing
 from gateway.tags.scaling import Linear, exact_below, type_of, unscaled, unscaled_float
 from gateway.tags.shaping import PLAIN, Shaping
 from gateway.values import Layout, Value, to_words
@@ -126,14 +126,15 @@ class Tag:
             return with_shaping(origin.formula.value, shaping)
         if origin.kept is not None:
             counter = isinstance(origin.kept, CounterRule)  # the reads of a bit are inverted
-            return field_decoder(self.layout, self._line, shaping if counter else PLAIN)
+            return field_decoder(self.layout, self.line, shaping if counter else PLAIN)
         if origin.shape is not None:
-            return field_decoder(self.layout, self._line, shaping)
+            return field_decoder(self.layout, self.line, shaping)
         bit = self.address.bit
-        return decoder(self.layout, self.unit_kind, self.single, bit, self._line, shaping)
+        return decoder(self.layout, self.unit_kind, self.single, bit, self.line, shaping)
 
     @property
-    def _line(self) -> Linear | None:
+    def line(self) -> Linear | None:
+        """The scale and offset of a number; None: it has none."""
         return self.shaping.line if self.layout.type.is_number else None
 
     @property
@@ -147,6 +148,13 @@ class Tag:
             if isinstance(one, kind):
                 return one
         return None
+
+    @property
+    def is_plain(self) -> bool:
+        """True if a good value is published as JSON with quality and time, and nothing else."""
+        names, clamp = self.shaping.names, self.shaping.clamp
+        is_json = self.publishing.payload is Form.JSON
+        return is_json and names is None and clamp is None and self.origin.word is None
 
     @property
     def polled(self) -> bool:
@@ -205,7 +213,7 @@ class Tag:
     @property
     def exact_below(self) -> float | None:
         """The amount below which a JSON number tells all values apart; None: it always does."""
-        line = self._line
+        line = self.line
         if line is None or self.layout.type.is_float:
             return None
         return exact_below(self.layout.type, line)
@@ -214,13 +222,13 @@ class Tag:
     def is_whole(self) -> bool:
         """True if it takes whole numbers only, as the device holds them."""
         kind = self.layout.type
-        return self._line is None and kind.is_number and not kind.is_float
+        return self.line is None and kind.is_number and not kind.is_float
 
     @property
     def value_type(self) -> str:
         """The type of the value, which a scale can make another one than that of the device."""
         kind = self.layout.type
-        of_one = type_of(kind.element, self._line)
+        of_one = type_of(kind.element, self.line)
         return f"{of_one}[{kind.count}]" if kind.count else of_one
 
     def encode(self, value: Value) -> list[int]:
@@ -286,7 +294,7 @@ class Tag:
     @property
     def _rounds(self) -> bool:
         """True when a write rounds the value to a step of the device."""
-        return self._line is not None and not self.layout.type.is_float
+        return self.line is not None and not self.layout.type.is_float
 
     def _check_limits(self, value: Value, description: str) -> None:
         if self.write is None or isinstance(value, (bool, str, tuple)):
@@ -318,7 +326,7 @@ class Tag:
         return units if part is None else [part.into(0, units[0])]
 
     def _unscaled(self, value: Scalar) -> Scalar:
-        line = self._line
+        line = self.line
         if line is None or isinstance(value, (bool, str)):
             return value
         if self.layout.type.is_float:

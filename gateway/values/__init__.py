@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from operator import index
+from typing import Any
 
 from gateway.errors import BadValue, ConfigError
 from gateway.values.numerals import (
@@ -199,17 +200,15 @@ def from_words(layout: Layout) -> FromWords:
         return lambda words: _from_bcd(_ordered(words, layout))
     if kind is Kind.TELEPHONE:
         return telephone_number
-    unpack = struct.Struct(STRUCT[kind]).unpack
+    unpack, number = struct.Struct(STRUCT[kind]).unpack, from_number(kind)
+    return lambda words: number(unpack(_octets(_ordered(words, layout)))[0])
+
+
+def from_number(kind: Kind) -> Callable[[Any], Scalar | None]:
+    """Returns the function that turns a number, as `struct` unpacks it, into the value."""
     if kind is Kind.FLOAT32:
-        return lambda words: shortest(unpack(_octets(_ordered(words, layout)))[0])
-    if kind is Kind.FLOAT64:
-        return lambda words: _finite(unpack(_octets(_ordered(words, layout)))[0])
-
-    def number(words: Words) -> Scalar | None:
-        value: int = unpack(_octets(_ordered(words, layout)))[0]
-        return value
-
-    return number
+        return shortest
+    return _finite if kind is Kind.FLOAT64 else index
 
 
 def from_word(layout: Layout) -> FromWord:

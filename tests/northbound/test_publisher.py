@@ -7,14 +7,22 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import pytest
 import zenoh
 
+from gateway.contract import payload
 from gateway.contract.keys import Keys
+from gateway.northbound.publishing import publisher as publishing
 from gateway.northbound.publishing.publisher import EVENTS_LIMIT, Publisher
 from gateway.northbound.publishing.slow_puts import SlowPuts
+from gateway.tags import Reason, bad, good
+from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Decoder, Samples
+from gateway.tags.shaping import PLAIN, Bounds, Shaping
 from tests.e2e.processes import slowed
 from tests.northbound.plant import (
     PlainDevice,
@@ -24,6 +32,7 @@ from tests.northbound.plant import (
     mixer,
     tag,
 )
+from tests.sim.plant import make_tag
 from tests.zenoh_peer import TIMEOUT, Received
 
 
@@ -64,6 +73,7 @@ class StuckSession:
         self.go = threading.Event()
         self.hangs = threading.Event()
         self.puts: list[tuple[int, str, Any]] = []
+        self.documents: list[bytes] = []
         self.priorities: list[zenoh.Priority] = []
         self._clock = itertools.count()
 
@@ -76,6 +86,7 @@ class StuckSession:
         self.hangs.set()
         assert self.go.wait(5)
         self.puts.append((timestamp, key, json.loads(data)["value"]))
+        self.documents.append(data)
         self.priorities.append(priority)
 
 
@@ -103,6 +114,108 @@ async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order(
     assert session.puts == sorted(session.puts)  # by their stamps
     assert publisher.counters.superseded == 19_998
     assert publisher.counters.published == 5
+
+
+class Block:
+    """A block of words in a mirror, read again and again."""
+
+    def __init__(self, shaping: Shaping = PLAIN) -> None:
+        made = (make_tag(f"D{n}", device="mixer", name=f"t{n}", type="uint16") for n in range(3))
+        self.tags = [replace(tag, shaping=shaping) for tag in made]
+        self._decoder = Decoder(self.tags, range(3))
+        self._mirror = Mirror(self.tags, 0)
+        self._scan = self._decoder.first((0, 0, 0), 1)
+        self._mirror.update(self._scan)
+
+    def read(self, *words: int) -> Samples:
+        self._scan = self._decoder.after(self._scan, words, self._scan.time + 1)
+        samples = self._mirror.update(self._scan)
+        assert isinstance(samples, Samples)
+        return samples
+
+
+async def test_of_scans_that_wait_the_newest_value_of_each_tag_is_put_in_order() -> None:
+    block, session = Block(), StuckSession()
+    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    publisher.scan(block.read(1, 1, 1))
+    await asyncio.to_thread(session.hangs.wait, TIMEOUT)  # within that scan
+    publisher.scan(block.read(2, 2, 2))
+    publisher.scan(block.read(3, 2, 2))
+    publisher.values([bad(block.tags[1], Reason.OVERDUE, 9)])
+    for word in range(4, 1000):
+        publisher.scan(block.read(word, 2, 2))
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+    assert [(key.rpartition("/")[2], value) for _, key, value in session.puts] == [
+        ("t0", 1),
+        ("t1", 1),
+        ("t2", 1),
+        ("t1", 2),
+        ("t2", 2),
+        ("t1", None),
+        ("t0", 999),
+    ]
+    assert session.puts == sorted(session.puts)  # by their stamps
+    assert publisher.counters.superseded == 997
+    assert publisher.counters.published == 7
+
+
+async def test_an_alarm_goes_before_the_rest_of_a_scan() -> None:
+    block, session, keys = Block(), StuckSession(), Keys("plant", "demo")
+    publisher = Publisher(keys, SlowPuts(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    publisher.scan(block.read(1, 1, 1))
+    await asyncio.to_thread(session.hangs.wait, TIMEOUT)
+    publisher.document(keys.writes, b'{"value": 7}')
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+    assert [value for *_, value in session.puts] == [1, 7, 1, 1]
+
+
+@pytest.mark.parametrize(
+    "shaping",
+    [Shaping(), Shaping(range=Bounds(0, 9)), Shaping(clamp=Bounds(0, 9)), Shaping(decimals=1)],
+)
+async def test_a_scan_has_the_documents_of_its_samples(shaping: Shaping) -> None:
+    block, session = Block(shaping), StuckSession()
+    session.go.set()
+    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    samples = block.read(1, 12, 3)
+    publisher.scan(samples)
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+    assert session.documents == [payload.value(sample) for sample in samples]
+
+
+async def test_the_loop_waits_until_many_values_are_put(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publishing, "_PAUSE", TIMEOUT)
+    session = StuckSession()
+    session.go.set()
+    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    for count in range(1, 6):
+        publisher.values(good(make_tag(f"D{n}", type="uint16"), 1, 0) for n in range(200))
+        publisher.pause()
+        assert publisher.counters.published == 200 * count
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+
+
+async def test_the_loop_waits_once_for_a_link_that_is_stuck(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(publishing, "_PAUSE", 0.2)
+    session = StuckSession()
+    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher.start(session)  # type: ignore[arg-type]
+    many = [make_tag(f"D{n}", type="uint16") for n in range(200)]
+    begun = time.monotonic()
+    for count in range(1000):
+        publisher.values(good(tag, count, 0) for tag in many)
+        publisher.pause()
+    assert time.monotonic() - begun < 100.0  # each time it would be 200 s
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
 
 
 async def test_outcomes_and_alarms_go_before_values_and_documents_that_wait() -> None:

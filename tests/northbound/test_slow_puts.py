@@ -3,10 +3,9 @@
 import pytest
 
 from gateway.northbound.publishing.slow_puts import ROUNDS, SlowPuts
-from gateway.tags import good
 from tests.northbound.plant import tag
 
-SPEED, LEVEL = (good(tag("mixer", name), 1, 0) for name in ("speed", "level"))
+SPEED, LEVEL = (tag("mixer", name) for name in ("speed", "level"))
 LIMIT = 0.05
 
 
@@ -28,7 +27,7 @@ def test_a_slow_put_and_those_after_it_are_put_again_in_rounds(losses: SlowPuts)
     assert losses.due(100.9) == []
     for pause in ROUNDS:
         assert losses.due(100.0 + pause - 0.01) == []
-        assert losses.due(100.0 + pause) == [LEVEL.tag, SPEED.tag]
+        assert losses.due(100.0 + pause) == [LEVEL, SPEED]
     assert losses.due(1000.0) == []
 
 
@@ -37,23 +36,23 @@ def test_the_next_slow_put_starts_the_rounds_again(losses: SlowPuts) -> None:
     losses.due(101.0)
     losses.sent([SPEED], LIMIT, 101.5)
     assert losses.due(102.4) == []
-    assert losses.due(102.5) == [LEVEL.tag, SPEED.tag]
+    assert losses.due(102.5) == [LEVEL, SPEED]
 
 
 def test_a_suspect_that_was_put_goes_behind_the_others(losses: SlowPuts) -> None:
     """A round that a slow put ended continues with the tags that it did not reach."""
     losses.sent([LEVEL, SPEED], LIMIT, 100.0)
     losses.sent([LEVEL], 0.0, 101.0)
-    assert losses.due(101.0) == [SPEED.tag, LEVEL.tag]
+    assert losses.due(101.0) == [SPEED, LEVEL]
 
 
 def test_puts_long_after_the_last_slow_one_are_not_suspect(losses: SlowPuts) -> None:
     losses.sent([LEVEL], LIMIT, 100.0)
     losses.sent([SPEED], 0.0, 100.0 + ROUNDS[-1] + 0.1)
-    assert losses.due(101.0) == [LEVEL.tag]
+    assert losses.due(101.0) == [LEVEL]
 
 
 def test_reloads_under_a_full_link_keep_no_tag_of_before(losses: SlowPuts) -> None:
     for n in range(100):  # each reload makes another tag of the same name
-        losses.sent([good(tag("mixer", "speed"), n, 0)], LIMIT, 100.0 + n)
+        losses.sent([tag("mixer", "speed")], LIMIT, 100.0 + n)
     assert len(losses.due(300.0)) == 1

@@ -48,8 +48,10 @@ def planned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
     monkeypatch.setattr(area_items, "coalesce", counted)
     area_items._remembered.cache_clear()  # it has no other reader
+    area_items._last_few.cache_clear()  # it has no other reader
     yield lengths
     area_items._remembered.cache_clear()
+    area_items._last_few.cache_clear()
 
 
 def row(letter: str, begin: int, step: int = 2, count: int = 20) -> list[Tag]:
@@ -110,11 +112,15 @@ def test_a_row_that_costs_otherwise_is_planned_anew(
     assert len(planned) == 2
 
 
-def test_very_long_rows_are_not_kept(planned: list[int]) -> None:
-    tags = row("D", 0, step=1, count=area_items.LONGEST_KEPT + 1)
-    for _ in range(2):
-        plan(tags, DRIVERS[0], seconds(DRIVERS[0]))
-    assert len(planned) == 2
+def test_of_long_rows_the_last_few_are_kept(planned: list[int]) -> None:
+    def planned_again(length: int) -> int:
+        before = len(planned)
+        plan(row("D", 0, step=1, count=length), DRIVERS[0], seconds(DRIVERS[0]))
+        return len(planned) - before
+
+    longer = [area_items.LONGEST_KEPT + more for more in range(1, 6)]
+    assert [planned_again(length) for length in longer] == [1] * 5
+    assert [planned_again(length) for length in (longer[-1], longer[0])] == [0, 1]
 
 
 @pytest.mark.parametrize("driver", DRIVERS, ids=repr)

@@ -226,14 +226,17 @@ class Event:
     def is_set(self) -> bool:
         return self._set
 
+    def clear(self) -> None:
+        self._set = False
+
     def set(self) -> None:
         self._set = True
         self.turns.wake(self._waiting, len(self._waiting))
 
     def wait(self, timeout: float | None = None) -> bool:
-        if not self._set:
+        if not self._set and (self.turns.running is not None or timeout is None):
             self.turns.wait(self._waiting, timeout)
-        return self._set
+        return self._set  # the loop, which may wait a moment, never waits on virtual time
 
 
 class Semaphore:

@@ -253,7 +253,7 @@ def test_only_changed_units_are_decoded() -> None:
         decoded.append(unit)
         return unit
 
-    tags = [make_tag(f"D{n}") for n in range(4)]
+    tags = [make_tag(f"D{n}", type="bcd16") for n in range(4)]
     for tag in tags:
         object.__setattr__(tag, "convert", convert)
     decoder = Decoder(tags, range(4))

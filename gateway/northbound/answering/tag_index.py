@@ -37,6 +37,8 @@ class TagIndex:
         self.names = frozenset(modes)
         self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
         self.only_blocks = frozenset(name for name, mode in modes.items() if mode == "only")
+        # True if each sample is one put, and a newer one may replace it.
+        self.only_values = not (self.with_blocks or any(tag.publishing.event for tag in self.tags))
 
     def become(self, other: "TagIndex") -> None:
         """Takes over the devices of another index. Each look-up sees the old or the new ones."""

@@ -9,7 +9,7 @@ again in rounds with growing pauses, and the next slow put starts the rounds aga
 import threading
 from collections.abc import Iterable
 
-from gateway.tags import Sample, Tag
+from gateway.tags import Tag
 
 # Seconds from the last slow put to each round. A link that sends nothing for longer is closed as
 # a rule; then all values are published again when it returns.
@@ -31,8 +31,8 @@ class SlowPuts:
         self._suspects: dict[str, Tag] = {}
         self._lock = threading.Lock()
 
-    def sent(self, samples: Iterable[Sample], took: float, now: float) -> None:
-        """Notes one put: its samples, and how many seconds it took."""
+    def sent(self, tags: Iterable[Tag], took: float, now: float) -> None:
+        """Notes one put: the tags of its samples, and how many seconds it took."""
         if took < self._limit and now > self._slow_at + ROUNDS[-1]:
             return
         with self._lock:
@@ -40,10 +40,9 @@ class SlowPuts:
                 self.congested += 1
                 self._slow_at = now
                 self._round = 0
-            for sample in samples:
-                key = sample.tag.key
-                self._suspects.pop(key, None)
-                self._suspects[key] = sample.tag
+            for tag in tags:
+                self._suspects.pop(tag.key, None)
+                self._suspects[tag.key] = tag
 
     def due(self, now: float) -> list[Tag]:
         """Returns the tags to put again now; the longest waiting first."""

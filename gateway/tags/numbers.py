@@ -1,0 +1,66 @@
+"""Numbers in a read of words: all of them are unpacked by one call in C.
+
+A block qualifies if each of its tags is one number of its own words, and one order of bytes fits
+all: words of a read become bytes, and the bytes numbers. Bits, texts, digits and arrays do not.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from operator import index
+from struct import Struct
+from typing import Any
+
+from gateway.protocols.driver import Unit
+from gateway.tags.decoding import DecodeOne, number_decoder
+from gateway.tags.tag import Tag
+from gateway.values import BYTES, STRUCT, Layout, Order
+
+Unpack = Callable[[Sequence[int]], tuple[Any, ...]]
+_BIG, _LITTLE = ">", "<"
+
+
+def numbers(
+    tags: Sequence[Tag], begins: Sequence[int]
+) -> tuple[Unpack, Sequence[DecodeOne] | None] | None:
+    """Returns the function from the units of a read to the numbers of the tags, and the functions
+    from each number to its value; None: they are the values. None if the tags do not qualify."""
+    form, end, orders = "", 0, {(_BIG, _BIG), (_BIG, _LITTLE), (_LITTLE, _BIG), (_LITTLE, _LITTLE)}
+    for tag, begin in zip(tags, begins, strict=True):
+        layout = tag.layout
+        code = STRUCT.get(layout.type.kind)
+        if code is None or not _is_number(tag) or begin < end:
+            return None
+        form += f"{2 * (begin - end)}x{code[1:]}"
+        end = begin + tag.span.size
+        orders &= _orders(layout, tag.span.size)
+    if not orders:
+        return None
+    words, octets = min(orders)
+    converts = [number_decoder(tag.layout, tag.line, tag.shaping) for tag in tags]
+    plain = all(convert is index for convert in converts)
+    return _unpack(words, octets, end, form), None if plain else converts
+
+
+def _is_number(tag: Tag) -> bool:
+    origin, kind = tag.origin, tag.layout.type.kind
+    others = (origin.shape, origin.formula, origin.kept, tag.element, tag.address.bit)
+    return (
+        tag.unit_kind is Unit.WORD and kind not in BYTES and all(other is None for other in others)
+    )
+
+
+def _orders(layout: Layout, words: int) -> set[tuple[str, str]]:
+    """Returns the orders in which words become bytes, and bytes numbers."""
+    if words == 1:
+        same = layout.byte_order is Order.HIGH_FIRST
+        return {(a, b) for a in (_BIG, _LITTLE) for b in (_BIG, _LITTLE) if (a == b) is same}
+    number = _BIG if layout.word_order is Order.HIGH_FIRST else _LITTLE
+    if layout.byte_order is Order.HIGH_FIRST:
+        return {(number, number)}
+    return {(_LITTLE if number == _BIG else _BIG, number)}
+
+
+@lru_cache(maxsize=4096)  # blocks of equal devices share it
+def _unpack(words: str, octets: str, count: int, form: str) -> Unpack:
+    pack, unpack = Struct(f"{words}{count}H").pack, Struct(f"{octets}{form}").unpack
+    return lambda units: unpack(pack(*units[:count]))
