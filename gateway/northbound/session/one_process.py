@@ -20,7 +20,8 @@ def only_process(folder: Path | None, gateway: str, *endpoints: str) -> Iterator
 
     `folder`: of the files that the gateway writes; None: no lock. `gateway`: its own key.
     `endpoints`: a machine may have separate networks. The system frees the lock when the process
-    ends, however it ends. Only owner and root can open the file, and so hold the lock.
+    ends, however it ends. Only owner and root can open the file, and so hold the lock. The event
+    loop opens it: no line runs yet.
     """
     name = hashlib.sha256("\n".join((gateway, *endpoints)).encode()).hexdigest()[:16]
     held = None if folder is None else _locked(folder / f"gateway-{name}.lock", gateway)
