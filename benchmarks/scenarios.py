@@ -33,7 +33,7 @@ PAGE = HERE / "docs" / "scenarios.md"
 RESULTS = HERE / "benchmarks" / "results" / "scenarios.json"
 # Seconds from the first values of all tags to the measurement. When a client connects, all values
 # are published again after 0.3 s, and after 5 s more.
-SETTLE = 6.0
+SETTLE = 9.0
 DRAIN = 1.5  # seconds after it, for what is still on its way
 PATIENCE = 180.0  # seconds for the first values
 QUIET = 0.1  # cores that other programs may use in a quiet run
@@ -80,7 +80,7 @@ CHANGING_ONLY = {SCENARIOS["over"], SCENARIOS["blocks"]}
 
 def file(scenario: Scenario, endpoint: str, port: int) -> Iterator[str]:
     """Yields the rows of the gateway's file."""
-    yield from ("gateway: {name: bench}", f"zenoh: {{listen: [{endpoint}], refresh: 24h}}")
+    yield from ("gateway: {name: bench}", f"zenoh: {{listen: [{endpoint}], refresh: 52w}}")
     defaults = f"every: {scenario.every * 1000:g}ms, type: {scenario.kind}, word_order: high_first"
     yield from (f"defaults: {{{defaults}}}", "lines:")
     for line in range(scenario.lines):

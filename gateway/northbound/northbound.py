@@ -132,12 +132,13 @@ class Northbound:
     # -- from the gateway --
 
     def publish(self, samples: Sequence[Sample]) -> None:
-        """Publishes one scan. Never blocks.
+        """Publishes one scan. Waits for no link; with many values for the thread, a moment.
 
         The plant updates its own samples first. Samples of event tags all go out, in order, none
         replaced by the next.
         """
         self._batches.publish(samples)
+        self._publisher.pause(len(samples))
 
     def set_online(self, device: str, online: bool) -> None:
         """Declares or undeclares the device's liveliness token."""

@@ -79,10 +79,11 @@ class _Turns:
 
     def __init__(self) -> None:
         self.lock = threading.Condition()
-        self.values = 0  # queued since the loop waited
+        self.values = 0  # new ones since the loop waited
         self._emptied = threading.Event()  # the thread has sent all that waited
         self._rests = False  # the thread waits for something to send
         self._stuck = -1  # puts so far when the loop waited in vain
+        self._resumed = 0.0  # when the loop waited last
 
     def rest(self) -> None:
         """Has the thread wait for something to send. It holds the lock."""
@@ -102,8 +103,11 @@ class _Turns:
             self._emptied.clear()
             self.lock.notify()
         sent = counters.published
-        if not self._emptied.wait(_PAUSE) and counters.published == sent:
+        # Twice as long as it ran: what is read can be sent, and reads go on.
+        ran = time.monotonic() - self._resumed
+        if not self._emptied.wait(min(_PAUSE, 2 * ran)) and counters.published == sent:
             self._stuck = sent
+        self._resumed = time.monotonic()
 
 
 class Publisher:
@@ -153,14 +157,12 @@ class Publisher:
             return
         stamp = self._session.new_timestamp
         with self._turns.lock:
-            count = len(self._waiting)
             for sample in samples:
                 key = self._value_keys.get(sample.tag) or self._value_key(sample)
                 # Removed first, so that the entry moves to the end: stamps leave in order.
                 if self._waiting.pop(key, None) is not None:
                     self.counters.superseded += 1
                 self._waiting[key] = (stamp(), key, sample)
-            self._turns.values += len(self._waiting) - count
             self._turns.lock.notify()
 
     def scan(self, samples: Samples) -> None:
@@ -174,7 +176,6 @@ class Publisher:
                 stamp = self._session.new_timestamp
                 puts = _Scan([stamp() for _ in keys], keys, samples)
                 self._waiting[samples.block] = (None, "", puts)
-                self._turns.values += len(keys)
                 self._turns.lock.notify()
                 return
             if isinstance(scan := older[2], _Scan):
@@ -183,8 +184,12 @@ class Publisher:
                 self._waiting[samples.block] = (None, "", rest)
         self.values(samples)
 
-    def pause(self) -> None:
-        """Waits until the thread has sent what waits, if that is much: `_PAUSE` at most."""
+    def pause(self, values: int) -> None:
+        """Waits until the thread has sent what waits, `_PAUSE` at most, after many new values.
+
+        Values that are published again do not count: reads must not wait for them.
+        """
+        self._turns.values += values
         self._turns.pause(self._waiting, self.counters)
 
     def _value_key(self, sample: Sample) -> str:
@@ -410,7 +415,6 @@ class ScanBatches:
             self._publisher.scan(samples)
         else:
             self._sort(samples)
-        self._publisher.pause()
 
     def _sort(self, samples: Sequence[Sample]) -> None:
         values = samples
