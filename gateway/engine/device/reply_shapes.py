@@ -50,8 +50,11 @@ class GoodReads:
 
     @property
     def spans(self) -> Iterable[Span]:
-        """The last block, then the widest, unless it is the same."""
-        return dict.fromkeys(span for span in (self.last, self.widest) if span is not None)
+        """The last block, then the widest, if it is wider."""
+        last, widest = self.last, self.widest
+        if last is None:
+            return ()
+        return (last, widest) if widest is not None and widest.size > last.size else (last,)
 
 
 @dataclass(slots=True)
