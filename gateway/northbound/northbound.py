@@ -39,6 +39,7 @@ from gateway.northbound.session.session_settings import configure, drop_limit, e
 from gateway.northbound.session.watchdog import Watchdog
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample, Tag, WriteResult
+from gateway.tags.scan import Samples
 from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -138,7 +139,8 @@ class Northbound:
         replaced by the next.
         """
         self._batches.publish(samples)
-        self._publisher.pause(len(samples))
+        if isinstance(samples, Samples):  # good reads
+            self._publisher.pause(len(samples))
 
     def set_online(self, device: str, online: bool) -> None:
         """Declares or undeclares the device's liveliness token."""

@@ -103,9 +103,9 @@ class _Turns:
             self._emptied.clear()
             self.lock.notify()
         sent = counters.published
-        # Twice as long as it ran: what is read can be sent, and reads go on.
+        # No longer than it ran: late reads turn values bad, which is more to send.
         ran = time.monotonic() - self._resumed
-        if not self._emptied.wait(min(_PAUSE, 2 * ran)) and counters.published == sent:
+        if not self._emptied.wait(min(_PAUSE, ran)) and counters.published == sent:
             self._stuck = sent
         self._resumed = time.monotonic()
 
@@ -187,7 +187,7 @@ class Publisher:
     def pause(self, values: int) -> None:
         """Waits until the thread has sent what waits, `_PAUSE` at most, after many new values.
 
-        Values that are published again do not count: reads must not wait for them.
+        Only values that were read count: reads must not wait for those that are put again.
         """
         self._turns.values += values
         self._turns.pause(self._waiting, self.counters)
