@@ -25,6 +25,10 @@ class Gateways(NamedTuple):
     prefix: str
 
 
+# The extras of pyproject.toml.
+_PACKAGES = {"opcua": "asyncua", "mqtt": "aiomqtt protobuf"}
+
+
 def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -39,7 +43,7 @@ def packages_of(name: str) -> Iterator[None]:
             raise
         raise ConfigError(
             f"bridge {name} needs the package {error.name}, which is not installed: "
-            f"pip install 'zenoh-plc-gateway[{name}]'"
+            f"pip install {_PACKAGES[name]}, with the pip of the gateway"
         ) from None
 
 
