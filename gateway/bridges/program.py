@@ -26,7 +26,7 @@ class Gateways(NamedTuple):
 
 
 # The extras of pyproject.toml.
-_PACKAGES = {"opcua": "asyncua", "mqtt": "aiomqtt protobuf"}
+_INSTALLED_BY = {"opcua": "pip install asyncua", "mqtt": "pip install aiomqtt protobuf"}
 
 
 def say(text: str) -> None:
@@ -43,7 +43,7 @@ def packages_of(name: str) -> Iterator[None]:
             raise
         raise ConfigError(
             f"bridge {name} needs the package {error.name}, which is not installed: "
-            f"pip install {_PACKAGES[name]}, with the pip of the gateway"
+            f"{_INSTALLED_BY[name]}, with the pip of the gateway"
         ) from None
 
 

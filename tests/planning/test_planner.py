@@ -203,13 +203,14 @@ def test_a_tag_too_long_for_a_request_is_an_error() -> None:
 
 def test_ten_times_the_tags_take_about_ten_times_as_long() -> None:
     """By the processor's clock; the least of some, for the machine may have other work."""
-    modbus = ModbusRtu(station=1)
-    seconds = partial(WireTiming(19200, 10).transaction, timing=modbus.timing, turnaround=0.01)
+    modbus, wire = ModbusRtu(station=1), WireTiming(19200, 10)
 
     def took(count: int) -> float:
         tags = [make_tag(f"holding:{3 * n}", modbus, name=str(n)) for n in range(count)]
         best = float("inf")
         for _ in range(2):
+            # Another function each time: the plans of equal rows are remembered by it.
+            seconds = partial(wire.transaction, timing=modbus.timing, turnaround=0.01)
             start = time.process_time()
             plan(tags, modbus, seconds)
             best = min(best, time.process_time() - start)
