@@ -1,7 +1,7 @@
 """ROS 2: values of the gateway as topics, and a service that writes.
 
     source /opt/ros/kilted/setup.bash
-    pip install zenoh-plc-gateway
+    pip install --no-deps --no-build-isolation .
     python3 examples/bridges/ros2.py --connect tcp/127.0.0.1:7447
 
 The tag `mixer/speed` is the topic `/plant/mixer/speed`, of diagnostic_msgs/DiagnosticArray: a
