@@ -6,16 +6,16 @@ from typing import Annotated
 import typer
 
 from gateway.bridges.program import Gateways, packages_of, run
+from gateway.cli.terminal import ROUTER, ZenohFile
 from gateway.errors import ConfigError
 
 cli = typer.Typer(help="Values to another system, and writes back.", no_args_is_help=True)
 
-_TCP = "tcp/127.0.0.1:7447"
+# Defaults of lists: typer copies them.
+_ROUTERS, _BROKERS, _NOBODY = [ROUTER], ["mqtt://127.0.0.1:1883"], list[str]()
+_SECURITY = ["sign", "encrypt"]
 Connect = Annotated[
     list[str], typer.Option(metavar="ENDPOINT", help="The gateway or its router; several: spare.")
-]
-ZenohFile = Annotated[
-    Path | None, typer.Option("--zenoh", metavar="FILE", help="A Zenoh file with user and TLS.")
 ]
 Prefix = Annotated[str, typer.Option(help="zenoh.prefix of the gateways.")]
 Writes = Annotated[bool, typer.Option("--writes", help="Accept writes.")]
@@ -28,7 +28,7 @@ def commands() -> None:
 
 @cli.command()
 def opcua(
-    connect: Connect = [_TCP],  # noqa: B006  (typer does not change it)
+    connect: Connect = _ROUTERS,
     zenoh: ZenohFile = None,
     prefix: Prefix = "plant",
     listen: Annotated[str, typer.Option(help="Address of the server.")] = (
@@ -42,12 +42,12 @@ def opcua(
     ] = False,
     writer: Annotated[
         list[str], typer.Option(metavar="NAME", help="A user that may write; several times.")
-    ] = [],  # noqa: B006
+    ] = _NOBODY,
     writes: Annotated[bool, typer.Option("--writes", help="Every user may write.")] = False,
     security: Annotated[
         list[str],
         typer.Option(help="sign, encrypt or none; several times."),
-    ] = ["sign", "encrypt"],  # noqa: B006
+    ] = _SECURITY,
     pki: Annotated[
         Path, typer.Option(metavar="FOLDER", help="Certificates: own, trusted, rejected.")
     ] = Path("opcua-pki"),
@@ -68,12 +68,12 @@ def opcua(
 
 @cli.command()
 def mqtt(
-    connect: Connect = [_TCP],  # noqa: B006
+    connect: Connect = _ROUTERS,
     zenoh: ZenohFile = None,
     prefix: Prefix = "plant",
     broker: Annotated[
         list[str], typer.Option(help="mqtt://host:port or mqtts://user@host; several: spare.")
-    ] = ["mqtt://127.0.0.1:1883"],  # noqa: B006
+    ] = _BROKERS,
     root: Annotated[
         str | None, typer.Option(help="The first levels of all topics (default: the prefix).")
     ] = None,
@@ -111,7 +111,7 @@ def mqtt(
 
 @cli.command()
 def influx(
-    connect: Connect = [_TCP],  # noqa: B006
+    connect: Connect = _ROUTERS,
     zenoh: ZenohFile = None,
     prefix: Prefix = "plant",
     to: Annotated[

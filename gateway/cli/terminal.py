@@ -29,6 +29,11 @@ Direct = Annotated[
     bool,
     typer.Option("--direct", help="Open the port without a gateway; none may be running on it."),
 ]
+# One endpoint of Zenoh, where a command does not read it from the file of a gateway.
+ROUTER = "tcp/127.0.0.1:7447"
+ZenohFile = Annotated[
+    Path | None, typer.Option("--zenoh", metavar="FILE", help="A Zenoh file with user and TLS.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document per line.")]
 
 Utc = Annotated[bool, typer.Option("--utc", help="Times in UTC instead of this machine's zone.")]

@@ -143,7 +143,7 @@ class Bridge:
     async def _retain(
         self, broker: aiomqtt.Client, topic: str, payload: bytes = b"", qos: int = 0
     ) -> None:
-        expiring = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        expiring = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # of paho
         expiring.MessageExpiryInterval = self._expire
         payload = payload or self._retained.get(topic, b"")
         await broker.publish(topic, payload, qos, retain=True, properties=expiring)

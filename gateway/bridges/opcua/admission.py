@@ -1,4 +1,4 @@
-"""Who may use the OPC UA server: certificates, users, and the places that there are."""
+"""Admission to the OPC UA server: certificates, users, and a bounded number of places."""
 
 import hmac
 import logging

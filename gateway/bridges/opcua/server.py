@@ -41,9 +41,10 @@ _LIMIT_OF = {
 
 
 class Options(NamedTuple):
-    """What the command line says. `security`: keys of `MODES`. `writers`: names; None: all users.
+    """The options of the command line.
 
-    `certificate` and `key` are made in the folder `pki` if they are not given.
+    `security`: keys of `MODES`. `writers`: names; None: all users. `certificate` and
+    `key` are made in the folder `pki` if they are not given.
     """
 
     listen: str

@@ -36,7 +36,7 @@ _WRITE = ua.AccessLevel.CurrentWrite.mask
 
 
 class Plant(Protocol):
-    """What the sessions need of the plant."""
+    """The plant, as far as the sessions use it."""
 
     async def write(self, item: ua.WriteValue, user: User) -> int: ...
 

@@ -1,4 +1,4 @@
-"""What the bench does at a port: lists ports, scans, and reads registers again and again."""
+"""The ports of the bench: it lists and scans them, and reads registers again and again."""
 
 import asyncio
 from collections.abc import Coroutine, Mapping, Sequence

@@ -26,7 +26,7 @@ _DIES_WITH_PARENT = 1  # of prctl
 
 
 class Running:
-    """Whether a gateway of the file runs, and a session with it.
+    """The gateway of the file, if one runs, and a session with it.
 
     A gateway of somebody else is only told of a change by `watch_config` of its file.
     """

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from gateway.cli.client import connected
 from gateway.cli.fleet.rows import Row, State, Told, rows, told_by, wanted_in
-from gateway.cli.terminal import FAILED, AsJson, err, out, printable
+from gateway.cli.terminal import FAILED, ROUTER, AsJson, ZenohFile, err, out, printable
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.gateway_address import GatewayAddress
 from gateway.contract.line_faults import span
@@ -23,19 +23,15 @@ from gateway.errors import ConfigError, GatewayError
 from gateway.plant.saved_file import SavedFile
 
 _STYLES = {State.MISSING: "red", State.FAULT: "red", State.LOOK: "yellow", State.GOOD: "green"}
-_DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 def fleet(
     prefix: Annotated[str, typer.Argument(metavar="PREFIX", help="of the keys, such as `works`.")],
     connect: Annotated[
         list[str] | None,
-        typer.Option(metavar="ENDPOINT", help=f"A router or a gateway; {_DEFAULT_ENDPOINT}."),
+        typer.Option(metavar="ENDPOINT", help=f"A router or a gateway; {ROUTER}."),
     ] = None,
-    zenoh_file: Annotated[
-        Path | None,
-        typer.Option("--zenoh", metavar="FILE", help="A Zenoh file: endpoints, user, TLS."),
-    ] = None,
+    zenoh_file: ZenohFile = None,
     folder: Annotated[
         Path | None,
         typer.Option(help="The files as they should be: shows what differs and what is missing."),
@@ -48,7 +44,7 @@ def fleet(
     as_csv: Annotated[bool, typer.Option("--csv", help="One row for each gateway.")] = False,
 ) -> None:
     """Print all gateways under a prefix, the worst first."""
-    endpoints = tuple(connect or (() if zenoh_file else (_DEFAULT_ENDPOINT,)))
+    endpoints = tuple(connect or (() if zenoh_file else (ROUTER,)))
     own = ZenohConfig(
         prefix=prefix, mode=ZenohMode.CLIENT, connect=endpoints, config_file=zenoh_file
     )

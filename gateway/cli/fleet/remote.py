@@ -1,7 +1,6 @@
 """The `remote` command: gives a running gateway another file, and confirms it when all is well."""
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,9 +48,7 @@ def remote(
             out.print(good if check else printable(f"{found['state']}: {found['why']}"))
             return
         out.print(f"loaded; it goes back at {found['until']} unless it is confirmed")
-        until = time.monotonic() + looks
-        while time.monotonic() < until:
-            time.sleep(min(1.0, looks))
+        time.sleep(looks)
         new_faults = _faults(client) - before
         for fault in sorted(new_faults):
             err.print(printable(f"new: {fault}"))
@@ -85,8 +82,7 @@ def _order(
 def _sent(client: Client, order: dict[str, Any]) -> dict[str, Any]:
     answer = client.order(_KEY, order)
     if "error" in answer:
-        print(printable(str(answer["reason"])), file=sys.stderr)
-        sys.exit(FAILED)
+        end(printable(str(answer["reason"])), FAILED)
     return answer
 
 

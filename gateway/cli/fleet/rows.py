@@ -1,4 +1,4 @@
-"""What a person needs to see of many gateways: one row for each, the worst first."""
+"""Rows of many gateways: one for each, the worst first, with the sentence that a person needs."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass

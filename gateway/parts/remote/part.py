@@ -72,7 +72,7 @@ class RemotePart:
         if change is not None:
             self._change = change
         if self._change.state == "waiting":
-            self._wait((self._change.until - self._core.plant.wall()) / 1e9)
+            self._wait()
 
     def activate(self) -> None:
         self._active = True
@@ -158,7 +158,7 @@ class RemotePart:
         except GatewayError:
             self._change = last
             raise
-        self._wait(seconds)
+        self._wait()
         await off_loop(self._folder.put, within=DISK_WITHIN)
         if why := await self._file.reload():
             await self._go_back(why[0])
@@ -183,14 +183,12 @@ class RemotePart:
         log.warning("file went back", why=why, digest=change.before)
         await self._note(replace(change, state="reverted", why=why))
 
-    def _wait(self, seconds: float) -> None:
-        """A clock that jumped makes no wait longer than the setting."""
-        seconds = min(max(0.0, seconds), max(self._settings.confirm, self._asked()))
+    def _wait(self) -> None:
+        """Has the change wait. A clock that jumped makes no wait longer than was asked for."""
+        change, now = self._change, self._core.plant.wall()
+        seconds = min(max(0, change.until - now), change.until - change.at) / 1e9
         self._ends_at = asyncio.get_running_loop().time() + seconds
         self._began.set()
-
-    def _asked(self) -> float:
-        return (self._change.until - self._change.at) / 1e9
 
     def _left(self) -> float:
         return max(0.0, self._ends_at - asyncio.get_running_loop().time())
