@@ -47,6 +47,24 @@ def append(file: int, data: bytes, *, sync: bool = False) -> None:
         raise
 
 
+def put(path: Path, data: bytes, mode: int = 0o600) -> None:
+    """Replaces a file, whole or not at all: on return it is on the disk. Raises `OSError`."""
+    new = path.with_name(f"{path.name}.new")
+    try:
+        new.unlink(missing_ok=True)
+        new.touch(0o600, exist_ok=False)
+        with new.open("wb") as file:
+            os.fchmod(file.fileno(), stat.S_IMODE(mode))
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    finally:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
+    sync(path.parent)
+
+
 def sync(path: Path) -> None:
     """Makes a file, or a new name in a folder, survive a power cut."""
     number = os.open(path, os.O_RDONLY)

@@ -70,3 +70,18 @@ def test_names_that_no_file_has(name: str) -> None:
 @pytest.mark.parametrize("name", ["a", "/a/b", "../a", "a" * 255, "~/x", "übung é"])
 def test_names_that_a_file_can_have(name: str) -> None:
     assert files.is_name(name)
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    file, new = tmp_path / "a", tmp_path / "a.new"
+    new.write_bytes(b"of a program that was killed")
+    files.put(file, b"1")
+    assert (file.read_bytes(), file.stat().st_mode & 0o777) == (b"1", 0o600)
+    files.put(file, b"2", 0o100664)
+    assert (file.read_bytes(), file.stat().st_mode & 0o777) == (b"2", 0o664)
+    new.mkdir()  # as if the disk refused it
+    with pytest.raises(OSError, match=r"a\.new"):
+        files.put(file, b"3")
+    assert file.read_bytes() == b"2"
+    new.rmdir()
+    assert [*tmp_path.iterdir()] == [file]

@@ -1,6 +1,5 @@
 """A small file that is replaced as a whole, by a thread: a stalled disk delays nothing else."""
 
-import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -69,16 +68,8 @@ class SavedFile:
         if snapshot == self._saved and self._path.exists():
             self.trouble = None
             return
-        temporary = self._path.with_name(self._path.name + ".new")
         try:
-            temporary.unlink(missing_ok=True)
-            temporary.touch(0o600, exist_ok=False)  # names of operators are in it
-            with temporary.open("wb") as file:
-                file.write(snapshot)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self._path)
-            files.sync(self._path.parent)
+            files.put(self._path, snapshot)  # names of operators are in it: closed to others
         except OSError as error:
             if self.trouble != str(error):
                 self.trouble = str(error)

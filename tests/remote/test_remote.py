@@ -212,7 +212,7 @@ def test_a_file_that_the_reload_refuses_goes_back_at_once(
 
 
 WRONG: list[tuple[dict[str, Any], type[GatewayError], str]] = [
-    ({"do": "apply", "file": "lines: ["}, BadValue, r"plant\.next\.yaml:2: no YAML"),
+    ({"do": "apply", "file": "lines: ["}, BadValue, r"plant\.yaml:2: no YAML"),
     ({"do": "apply", "file": file("Q1")}, BadValue, "Q1"),
     ({"do": "apply", "file": file("D0")}, BadValue, "runs a file with these settings already"),
     ({"do": "apply", "file": file("D1", **{"7447": "7448"})}, BadValue, "zenoh.listen changed"),
@@ -288,10 +288,11 @@ def test_a_folder_that_takes_no_file(run_virtual: Virtual, tmp_path: Path) -> No
     async def whole() -> None:
         gateway = Gateway(tmp_path)
         part = await gateway.part()
-        (tmp_path / "plant.next.yaml").mkdir()  # as if the disk refused it
-        with pytest.raises(GatewayError, match=r"plant\.next\.yaml: "):
+        (tmp_path / "plant.yaml.new").mkdir()  # as if the disk refused it
+        with pytest.raises(GatewayError, match=r"plant\.yaml\.new: "):
             await ask(part, "apply", file=file("D1"))
         assert gateway.path.read_text() == file("D0")
+        assert (part.document()["state"], gateway.loaded) == ("reverted", gateway.loaded[:1])
 
     run_virtual(whole())
 

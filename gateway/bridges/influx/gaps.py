@@ -5,6 +5,7 @@ import json
 from contextlib import suppress
 from pathlib import Path
 
+from gateway import files
 from gateway.bridges.program import say
 from gateway.errors import ConfigError
 
@@ -59,17 +60,11 @@ class Gaps:
         if self._path is None or known == self._saved:
             return
         try:
-            await asyncio.to_thread(_write, self._path, json.dumps(known))
+            await asyncio.to_thread(files.put, self._path, json.dumps(known).encode())
         except OSError as error:
             say(f"{self._path} is not written: {error.strerror}")
         else:
             self._saved = known
-
-
-def _write(path: Path, text: str) -> None:
-    new = path.with_name(f"{path.name}.new")
-    new.write_text(text)
-    new.replace(path)
 
 
 def _read(path: Path) -> dict[str, str]:

@@ -145,7 +145,13 @@ class Trial:
             except OSError as error:
                 raise ConfigError(f"{self._before} cannot be written: {error.strerror}") from None
             try:
-                replace(draft.path, draft.file, text, load, backup=False)
+                replace(
+                    draft.path,
+                    draft.file,
+                    text,
+                    lambda new: load(draft.path, text=new),
+                    backup=False,
+                )
             except ConfigError:
                 self._before.unlink(missing_ok=True)
                 raise

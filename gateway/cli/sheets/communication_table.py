@@ -49,7 +49,7 @@ def import_transfers(sheet: Path, into: Path | None, master: str, *, dry_run: bo
     comment = f"# {len(found)} rows of {sheet.name}, which {master} copied as the master"
     body = newline.join([comment, "transfers:", *_lines(found, names, master), ""])
     after = f"{text.rstrip()}{newline}{newline}{body}"
-    kept = replace(into, before, after, lambda new: _check(new, into.resolve()), dry=dry_run)
+    kept = replace(into, before, after, lambda text: _check(into, text), dry=dry_run)
     for line in (f"{into.name}: {len(found)} transfers of {sheet.name} added", *kept):
         print(line)
 
@@ -92,10 +92,8 @@ def _lines(found: Sequence[Transferred], names: dict[int, str], master: str) -> 
     return rows
 
 
-def _check(new: Path, own: Path) -> None:
+def _check(into: Path, text: str) -> None:
     try:
-        load(new)
+        load(into, text=text)
     except ConfigErrors as error:
-        messages = [text.replace(str(new), str(own)) for text in error.messages]
-        last = "nothing was written"
-        raise ConfigErrors([*messages, last], error.count) from None
+        raise ConfigErrors([*error.messages, "nothing was written"], error.count) from None

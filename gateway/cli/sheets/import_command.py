@@ -143,7 +143,7 @@ def add_tags(
         ending = "one mistake" if error.count == 1 else f"{error.count} mistakes"
         last = f"{ending}: nothing was written"
         raise ConfigErrors([*error.messages, last], error.count) from None
-    kept = replace(into, before, text, load, backup=backup, dry=dry_run)
+    kept = replace(into, before, text, lambda new: load(into, text=new), backup=backup, dry=dry_run)
     for use in uses:
         print_notes(sheet, use.notes)
     added = f"tags of {sheet.name} added to"

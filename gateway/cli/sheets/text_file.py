@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from gateway import files
 from gateway.errors import ConfigError
 
 BOM = b"\xef\xbb\xbf"
@@ -30,7 +31,7 @@ def replace(
     into: Path,
     before: bytes,
     after: str,
-    check: Callable[[Path], object],
+    check: Callable[[str], object],
     *,
     backup: bool = True,
     dry: bool = False,
@@ -38,23 +39,20 @@ def replace(
     """Replaces the text of a file at once, after `check` of the new one, which raises
     `ConfigError`, and only if it is still as `before`. Returns a sentence about the backup, if
     there is one. `dry`: only checks."""
+    check(after)
+    if dry:
+        return []
     into = into.resolve()  # the file itself, not a link to it
-    new = into.with_name(f"{into.name}.new")
     try:
-        new.write_bytes(before[: len(before) - len(before.removeprefix(BOM))] + after.encode())
-        check(new)
-        shutil.copymode(into, new)
         if into.read_bytes() != before:
             raise ConfigError(f"{into.name} was changed meanwhile: import again")
-        if backup and not dry:
+        if backup:
             shutil.copy2(into, backup_of(into))
-        if not dry:
-            new.replace(into)
+        start = before[: len(before) - len(before.removeprefix(BOM))]
+        files.put(into, start + after.encode(), into.stat().st_mode)
     except OSError as error:
         raise ConfigError(f"{into} cannot be written: {error.strerror}") from None
-    finally:
-        new.unlink(missing_ok=True)
-    return [f"the file before is {backup_of(into).name}"] if backup and not dry else []
+    return [f"the file before is {backup_of(into).name}"] if backup else []
 
 
 def backup_of(into: Path) -> Path:

@@ -1,7 +1,6 @@
 """The configuration file on disk, and the earlier ones beside it. Everything here blocks."""
 
 import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,18 +26,11 @@ class Folder:
         self.path = path
         self._keep = keep
         self._kept = self.path.with_name(f"{self.path.name}.kept")
-        self._next = self.path.with_name(f"{self.path.stem}.next{self.path.suffix}")
 
-    def stage(self, text: str) -> Config:
-        """Writes the text beside the file, and checks it there. Raises `BadValue`, `OSError`."""
-        self._next.unlink(missing_ok=True)
-        with self._next.open("x") as file:
-            shutil.copymode(self.path, self._next)
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+    def checked(self, text: str) -> Config:
+        """Returns what the file would be with this text. Raises `BadValue`."""
         try:
-            return load(self._next)
+            return load(self.path, text=text)
         except ConfigErrors as error:
             mistakes = str(error).splitlines()
             more = f" and {len(mistakes) - _MOST_TOLD} more" if len(mistakes) > _MOST_TOLD else ""
@@ -56,8 +48,7 @@ class Folder:
         copy."""
         self._kept.mkdir(mode=0o700, exist_ok=True)
         copy = self._kept / f"{now}-{digest}{self.path.suffix}"
-        shutil.copy2(self.path, copy)
-        files.sync(copy)
+        files.put(copy, files.read(self.path), self.path.stat().st_mode)
         for old in [*self.earlier()][: -self._keep]:
             old.file.unlink(missing_ok=True)
         return copy.name
@@ -74,13 +65,11 @@ class Folder:
         except UnicodeDecodeError:
             raise BadValue(f"{kept.name} is no text") from None
 
-    def put(self, earlier: str = "") -> None:
-        """Replaces the file by the staged one, or by an earlier one: whole, or not at all. Where
-        it is a link, the file behind it."""
+    def put(self, data: bytes) -> None:
+        """Replaces the file; where it is a link, the file behind it. Raises `OSError`."""
         real = Path(os.path.realpath(self.path))
-        new = real.with_name(f"{real.name}.new")
-        shutil.copy2(self._kept / earlier if earlier else self._next, new)
-        files.sync(new)
-        new.replace(real)
-        files.sync(real.parent)
-        self._next.unlink(missing_ok=True)
+        files.put(real, data, real.stat().st_mode)
+
+    def put_back(self, copy: str) -> None:
+        """Replaces the file by an earlier one. Raises `OSError`."""
+        self.put(files.read(self._kept / copy))

@@ -128,7 +128,7 @@ class RemotePart:
 
     async def _checked(self, text: str) -> Config:
         """Raises `BadValue` with the mistakes, and for what only a restart takes over."""
-        found = await off_loop(self._folder.stage, text, within=DISK_WITHIN)
+        found = await off_loop(self._folder.checked, text, within=DISK_WITHIN)
         if changed := needs_restart(self._file.current, found):
             text = "this needs a restart, and a person beside the gateway"
             raise BadValue(f"{', '.join(changed)} changed: {text}")
@@ -159,7 +159,11 @@ class RemotePart:
             self._change = last
             raise
         self._wait()
-        await off_loop(self._folder.put, within=DISK_WITHIN)
+        try:
+            await off_loop(self._folder.put, text.encode(), within=DISK_WITHIN)
+        except OSError as error:
+            await self._note(replace(self._change, state="reverted", why=f"{error.strerror}"))
+            raise
         if why := await self._file.reload():
             await self._go_back(why[0])
             raise BadValue("; ".join(why[:3]))
@@ -175,7 +179,7 @@ class RemotePart:
             await self._note(replace(change, state="failed", why=why))
             return
         if on_disk != change.before:
-            await off_loop(self._folder.put, change.copy, within=DISK_WITHIN)
+            await off_loop(self._folder.put_back, change.copy, within=DISK_WITHIN)
         if mistakes := await self._file.reload():
             why = f"{why}; the file before is back on disk, and was not loaded: {mistakes[0]}"
             await self._note(replace(change, state="failed", why=why))
