@@ -111,7 +111,7 @@ class Carrier:
         row.ends[type(end).__name__] += 1
         judge.story.counts[f"carried {type(end).__name__}"] += 1
         self.buses[tag.device].note("carried", by, value, type(end).__name__)
-        if fresh:
+        if fresh and not early:  # a substitute has no age
             self._judge_age(row, tag, since, read_at)
         client = Client(self.devices[tag.device], judge, self.buses[tag.device], _NO_CHANCE, 1.0)
         obeyed = times(station, tag, known)
