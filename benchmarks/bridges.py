@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gateway.bridges.mqtt.sparkplug.messages import Payload
-from tests.bridges.campaign import InfluxServer
+from tests.bridges.campaign_clients import InfluxServer
 from tests.bridges.played import PlayedGateway
 from tests.conftest import needs
 from tests.e2e.processes import Program, free_port, listens, until

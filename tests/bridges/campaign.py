@@ -7,34 +7,27 @@ that a bridge stands still. When all runs again, every client has the present va
 """
 
 import argparse
-import json
 import os
 import random
 import signal
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-from paho.mqtt.client import Client, MQTTMessage
-from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
-
+from tests.bridges.campaign_clients import DEVICES, TAGS, InfluxServer, JsonClient, OpcuaClient
+from tests.bridges.opcua_clients import folder as opcua_folder
 from tests.bridges.played import PlayedGateway
 from tests.bridges.sparkplug_host import SparkplugHost
 from tests.conftest import needs
 from tests.e2e.processes import Program, free_port, listens, slowed, until
 from tests.zenoh_peer import free_endpoint
 
-DEVICES = ("a", "b", "c")
-TAGS: dict[str, dict[str, Any]] = {
-    f"{device}/{tag}": {"type": "int32"} for device in DEVICES for tag in ("one", "two", "three")
-}
+PEERS = {"mqtt": "broker", "sparkplug": "broker", "influx": "server", "opcua": "scada"}
 LATE = 30.0  # seconds: keep-alive, lease, expiry
 AGAIN = 60.0  # seconds until all is right again
 
@@ -59,98 +52,6 @@ class Truth:
         return since is not None and time.monotonic() - since < late
 
 
-class JsonClient:
-    """Shows a value while it is good, and the bridge `online`."""
-
-    def __init__(self, port: int) -> None:
-        self._values: dict[str, int | None] = dict.fromkeys(TAGS)
-        self._online = False
-        self._client = Client(
-            CallbackAPIVersion.VERSION2, "reader", protocol=MQTTProtocolVersion.MQTTv5
-        )
-        self._client.reconnect_delay_set(1, 1)
-        self._client.on_connect = lambda *_: self._subscribe()
-        self._client.on_disconnect = lambda *_: self._forget()
-        self._client.on_message = self._arrived
-        self._client.connect_async("127.0.0.1", port, 10)
-
-    def __enter__(self) -> Self:
-        self._client.loop_start()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
-
-    def shown(self) -> dict[str, object]:
-        return dict(self._values) if self._online else {}
-
-    def _subscribe(self) -> None:
-        self._client.subscribe("plant/#", 1)
-
-    def _forget(self) -> None:
-        self._online, self._values = False, dict.fromkeys(TAGS)
-
-    def _arrived(self, _client: object, _data: object, message: MQTTMessage) -> None:
-        key = message.topic.removeprefix("plant/")
-        if key == "@bridge":
-            self._online = message.payload == b"online"
-        elif key in TAGS:
-            known = json.loads(message.payload)
-            self._values[key] = known["value"] if known["quality"] == "good" else None
-
-
-class InfluxServer:
-    """Keeps the last line of each tag; answers 503 while it is `ill`."""
-
-    def __init__(self) -> None:
-        self.ill = False
-        self._values: dict[str, tuple[int, int | None]] = {}
-        self.good: list[tuple[str, int]] = []
-        server = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                body = self.rfile.read(int(self.headers["Content-Length"])).decode()
-                self.send_response(503 if server.ill else 204)
-                self.end_headers()
-                if not server.ill:
-                    server.take(body)
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self._http = HTTPServer(("127.0.0.1", 0), Handler)
-        self._thread = threading.Thread(target=self._http.serve_forever)
-        self.url = f"http://127.0.0.1:{self._http.server_port}/write"
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._http.shutdown()
-        self._thread.join()
-        self._http.server_close()
-
-    def take(self, body: str) -> None:
-        for line in body.splitlines():
-            if not line.startswith("plc,"):
-                continue
-            about, fields, at = line.split(" ")
-            device, name = (part.partition("=")[2] for part in about.split(",")[1:3])
-            is_good = "good=true" in fields
-            value = int(float(fields.partition("value=")[2].partition(",")[0])) if is_good else None
-            key = f"{device}/{name}"
-            if value is not None:
-                self.good.append((key, value))
-            if int(at) >= self._values.get(key, (0, None))[0]:
-                self._values[key] = int(at), value
-
-    def shown(self) -> dict[str, object]:
-        return {key: value for key, (_, value) in self._values.items()}
-
-
 class Campaign:
     """One plant with its bridges. `broken`: sentences about what was shown and was not so."""
 
@@ -161,6 +62,7 @@ class Campaign:
         self._counter = 0
         self._truth = Truth()
         self._port, self._endpoint = free_port(), free_endpoint()
+        self._url = f"opc.tcp://127.0.0.1:{free_port()}"
         self._programs: dict[str, Program] = {}
         self._stack = ExitStack()
         self._is_there, self._charts_are_old = True, False
@@ -168,24 +70,33 @@ class Campaign:
 
     def __enter__(self) -> Self:
         enter = self._stack.enter_context
-        self._gateway = enter(PlayedGateway(self._endpoint, TAGS))
+        self._gateway = PlayedGateway(self._endpoint, TAGS)
         self._influx = enter(InfluxServer())
+        opcua_folder(self._folder / "opcua")
+        self.start("scada")
         self.start("broker")
         self._json = enter(JsonClient(self._port))
         self._host = enter(SparkplugHost(self._port, "g", "n"))
-        for name in ("mqtt", "sparkplug", "influx"):
+        for name in PEERS:
             self.start(name)
         return self
 
     def __exit__(self, *_error: object) -> None:
-        for name in list(self._programs):
+        for name in [*self._programs, "scada"]:
             self.kill(name)
         self._stack.close()
+        self._gateway.close()
 
     # -- programs --
 
     def start(self, name: str) -> None:
-        broker = f"mqtt://127.0.0.1:{self._port}"
+        broker, opcua = f"mqtt://127.0.0.1:{self._port}", self._folder / "opcua"
+        if name == "server":
+            self._influx.start()
+            return
+        if name == "scada":
+            self._scada = OpcuaClient(self._url, opcua)
+            return
         if name == "broker":
             store = self._folder / "broker"
             store.mkdir(exist_ok=True)
@@ -205,12 +116,18 @@ class Campaign:
                 *("influx", "--to", self._influx.url, "--every", 0.2),
                 *("--state", self._folder / "influx.json"),
             ),
+            "opcua": (
+                *("opcua", "--listen", self._url, "--users", opcua / "users.txt"),
+                *("--pki", opcua / "pki"),
+            ),
         }[name]
         command = (sys.executable, "-m", "gateway", "bridge", *options)
         self._programs[name] = Program(*command, "--connect", self._endpoint)
 
     def kill(self, name: str, by: signal.Signals = signal.SIGKILL) -> None:
-        if program := self._programs.pop(name, None):
+        if name in ("server", "scada"):
+            (self._influx if name == "server" else self._scada).kill()
+        elif program := self._programs.pop(name, None):
             if program.running:
                 program.end(by)
             else:
@@ -220,22 +137,24 @@ class Campaign:
 
     def step(self) -> str:
         """Does one thing at random, and returns its name."""
-        bridges = ("mqtt", "sparkplug", "influx")
+        bridge = self._random.choice(list(PEERS))
         what: dict[str, Callable[[], object]] = {
-            "bridge killed": lambda: self._again([self._random.choice(bridges)]),
-            "bridge ended": lambda: self._again([self._random.choice(bridges)], signal.SIGTERM),
-            "broker killed": lambda: self._again(["broker"]),
-            "both killed": lambda: self._again(["broker", self._random.choice(bridges[:2])]),
-            "all killed": lambda: self._again(["broker", *bridges]),
-            "bridge stands still": lambda: self._held(self._random.choice(bridges)),
+            "bridge killed": lambda: self._again([bridge]),
+            "bridge ended": lambda: self._again([bridge], signal.SIGTERM),
+            "peer killed": lambda: self._again([PEERS[bridge]]),
+            "both killed": lambda: self._again([bridge, PEERS[bridge]]),
+            "all killed": lambda: self._again([*dict.fromkeys(PEERS.values()), *PEERS]),
+            "bridge stands still": lambda: self._held(bridge),
             "gateway goes": self._leave,
+            "gateway killed": self._die,
             "device silent": self._silent,
             "server ill": self._ill,
         }
         name = self._random.choice(list(what))
         what[name]()
-        self.done[name] += 1
-        return name
+        about = f"{name}: {bridge}" if name.startswith(("bridge", "peer", "both")) else name
+        self.done[about] += 1
+        return about
 
     def run_for(self, seconds: float) -> None:
         """Values change, and the clients are looked at, all the time."""
@@ -288,11 +207,10 @@ class Campaign:
         self._charts_are_old = False
 
     def nothing_good(self) -> bool:
-        """Returns True if the clients of the broker show nothing as good."""
+        """Returns True if no client shows a good value, charts apart."""
         shown = self._shown()
-        return not any(
-            value is not None for name in ("mqtt", "sparkplug") for value in shown[name].values()
-        )
+        del shown["influx"]
+        return not any(value is not None for of in shown.values() for value in of.values())
 
     def _lacking(self) -> list[str]:
         return [
@@ -307,6 +225,8 @@ class Campaign:
             "mqtt": self._json.shown(),
             "sparkplug": dict(self._host.values),
             "influx": self._influx.shown(),
+            "opcua": dict(self._scada.watched),
+            "opcua, read": dict(self._scada.read),
         }
 
     def _pause(self) -> None:
@@ -315,7 +235,7 @@ class Campaign:
     def _again(self, names: list[str], by: signal.Signals = signal.SIGKILL) -> None:
         for name in names:
             self.kill(name, by)
-        self._charts_are_old = "influx" in names
+        self._charts_are_old = "influx" in names or "server" in names
         self._random.shuffle(names)
         for name in names:
             self._pause()
@@ -326,16 +246,24 @@ class Campaign:
             self._charts_are_old = name == "influx"
             self.run_for(self._random.choice((2, 8, 40)))
 
-    def _leave(self) -> None:
-        self._gateway.leave()
+    def _die(self) -> None:
+        self._gateway.close()
+        self._away()
+        self._gateway = PlayedGateway(self._endpoint, TAGS)
+        self._is_there = True
+
+    def _away(self) -> None:
         self._is_there = False
+        self._offline.clear()
         for key in TAGS:
             self._truth.set(key, None)
         self._pause()
+
+    def _leave(self) -> None:
+        self._gateway.leave()
+        self._away()
         for key in TAGS:  # what happened meanwhile is in the first answer
-            self._counter += 1
             self._gateway.documents[key] |= {"value": None, "quality": "bad", "reason": "starting"}
-        self._offline.clear()
         self._gateway.arrive()
         self._is_there = True
 

@@ -14,12 +14,12 @@ def test_nothing_is_good_after_a_broker_with_a_store_and_its_bridges_ended_toget
     with Campaign(tmp_path, seed=0, expire=1) as campaign:
         campaign.change()
         campaign.settle()
-        for name in ("broker", "mqtt", "sparkplug"):
+        for name in ("broker", "mqtt", "sparkplug", "opcua"):
             campaign.kill(name)
-        until(campaign.nothing_good, "the clients have lost the broker")
+        until(campaign.nothing_good, "the clients have lost the broker and the server")
         campaign.start("broker")  # with what it has stored
         until(campaign.nothing_good, "what it has stored expires")
-        for name in ("mqtt", "sparkplug"):
+        for name in ("mqtt", "sparkplug", "opcua"):
             campaign.start(name)
         campaign.change()
         campaign.settle()
