@@ -60,6 +60,7 @@ class Device:
     tags: list[Tag]
     blocks: bool | Literal["only"] = False
     control: bool = False
+    templates: tuple[str, ...] = ()
 
 
 @dataclass

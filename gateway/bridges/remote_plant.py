@@ -6,7 +6,7 @@ turn good again by values that arrive after the token has returned, never by old
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import suppress
 
 import orjson
@@ -22,13 +22,14 @@ QUERY_EVERY = 60.0  # seconds between two queries of all values without a known 
 RETRY_AFTER = 0.5  # seconds, doubled up to QUERY_EVERY while values are missing
 SETTLE = 0.1  # seconds
 PAGE = 10_000  # samples of the history
+MOST_TEMPLATES = 20  # of one device
 
 
 class RemotePlant:
     """All tags under a prefix. Keys are `device/tag`.
 
     Calls in the event loop `described(key, meta)` for every new or changed description, and then
-    `changed(key, known)` for every new value.
+    `changed(key, known)` for every new value; `arranged` with the templates of each device.
     """
 
     def __init__(
@@ -37,12 +38,13 @@ class RemotePlant:
         prefix: str,
         described: Callable[[str, Known], None],
         changed: Callable[[str, Known], None],
+        arranged: Callable[[Mapping[str, Sequence[str]]], None] | None = None,
     ) -> None:
         self.tags: dict[str, Known] = {}
         self.values: dict[str, Known] = {}
         self.requests = Requests(session, prefix)
         self._prefix = prefix
-        self._described, self._changed = described, changed
+        self._described, self._changed, self._arranged = described, changed, arranged
         self._query_due, self._arrived = asyncio.Event(), asyncio.Event()
         self._presence = Presence()
         self._loaded: dict[str, object] = {}  # when each gateway took its file, by key
@@ -169,6 +171,19 @@ class RemotePlant:
                 if key not in self.values:
                     self._store(key, bad("starting"))
         self._presence.described(described)
+        if self._arranged is not None:
+            self._arranged(await self._templates())
+
+    async def _templates(self) -> dict[str, list[str]]:
+        """Queries the templates of each device."""
+        found: dict[str, list[str]] = {}
+        for reply in await self.requests.ask("@gateway/*/@introspect"):
+            with suppress(ValueError, LookupError, TypeError, AttributeError):  # another program's
+                payload = orjson.loads(reply.ok.payload.to_bytes()) if reply.ok else {}
+                for device, about in payload.get("devices", {}).items():
+                    names = about["templates"][:MOST_TEMPLATES]
+                    found[device] = [name for name in names if isinstance(name, str)]
+        return found
 
     async def _query(self) -> bool:
         """Returns True if every tag of every device with a token was answered."""

@@ -44,6 +44,7 @@ from gateway.transport.port import ListenAddress, ModemAddress, SerialPath, Simu
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
 WRITERS_STATE = FilePath("writers.json")
+_OTHERS = {"protocol", "use"}  # of a device, besides its section and the driver's settings
 _TIMES = ("reply_timeout", "turnaround", "silence", "retries")  # a device may have its own
 
 
@@ -186,7 +187,7 @@ class Builder:
             section(DeviceSection, raw, path, self.mistakes, "a device")
             return None
         common = {key: value for key, value in raw.items() if key in DeviceSection.model_fields}
-        own = {k: v for k, v in raw.items() if k not in common and k != "protocol"}
+        own = {k: v for k, v in raw.items() if k not in common and k not in _OTHERS}
         settings = section(DeviceSection, common, path, self.mistakes, "a device")
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
@@ -232,6 +233,7 @@ class Builder:
             identity=settings.identity or {},
             blocks=settings.blocks,
             control=settings.control,
+            templates=tuple(raw.get("use", ())),
             enabled=settings.enabled,
             tags=tags,
             served=served,

@@ -20,7 +20,7 @@ from gateway.config.messages import Mistakes, OptionPlaces
 from gateway.config.settings.records import Config
 from gateway.config.settings.sections import Written, reads, writes
 from gateway.config.sheets import Grid
-from gateway.config.templates.expand import expanded
+from gateway.config.templates.expand import devices_in, expanded
 from gateway.config.yaml.file import TEXTS, read_yaml
 from gateway.config.yaml.scalars import scalar
 
@@ -71,6 +71,8 @@ def expanded_text(path: str | Path) -> str:
     file, mistakes = read_yaml(Path(path), TEXTS)
     data = expanded(file, mistakes, Path(path).parent)
     mistakes.raise_all()
+    for device in devices_in(data):
+        device.pop("use", None)
     return dumped(data)
 
 

@@ -33,6 +33,10 @@ class Device(Protocol):
     def control(self) -> bool:
         """Commands are permitted."""
 
+    @property
+    def templates(self) -> tuple[str, ...]:
+        """The templates that the file uses for it."""
+
 
 class Plant(Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""

@@ -7,6 +7,7 @@ that a bridge stands still. When all runs again, every client has the present va
 """
 
 import argparse
+import logging
 import os
 import random
 import signal
@@ -300,6 +301,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # a lost connection is a page there
     end = time.monotonic() + given.hours * 3600
     with tempfile.TemporaryDirectory() as folder, Campaign(Path(folder), given.seed) as campaign:
         campaign.settle()

@@ -177,7 +177,8 @@ def test_an_opc_ua_client_reads_a_gateway_and_its_history(plant: Plant, tmp_path
     file = write_config(
         tmp_path / "c.yaml",
         plant.endpoint,
-        {"hall": vigor_line("simulator", tags)},
+        {"hall": vigor_line("simulator", tags, use=["press", "line/hall"])},
+        templates={"press": {"retries": 1}, "line/hall": {"verify_reads": 1}},
         history={"path": "history.db"},
         writers={"file": str(plant.folder / "users.txt")},
     )
@@ -185,6 +186,11 @@ def test_an_opc_ua_client_reads_a_gateway_and_its_history(plant: Plant, tmp_path
     plant.gateway.close()
     with started(file) as gateway:
         until(lambda: plant.status("mixer/recipe") == "GoodEdited", "a value is simulated")
+        folder = "ns=2;s=/@templates/"
+        until(lambda: len(plant.ask("browse", folder)) == 2, "it has the templates")
+        assert plant.ask("browse", f"{folder}line/") == [f"{folder}line/hall/"]
+        for template in ("press/", "line/hall/"):
+            assert plant.ask("browse", folder + template) == [node("/mixer/")]
         meta = plant.ask("meta", speed)
         assert (meta["type"], meta["access"], meta["unit"]) == ("Double", 5, "rpm")
         assert plant.ask("meta", recipe)["range"] == [1, 40]

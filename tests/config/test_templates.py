@@ -73,7 +73,9 @@ def loaded(folder: Path, text: str) -> Config:
     alone = folder / "expanded.yaml"
     alone.write_text(expanded_text(path), encoding="utf-8")
     assert "use:" not in alone.read_text()
-    assert repr(load(alone)) == repr(config)  # tags are equal to themselves only
+    # Tags are equal to themselves only. The names of the templates are gone, nothing else.
+    plain = re.sub(r"templates=\([^)]*\)", "templates=()", repr(config))
+    assert repr(load(alone)) == plain
     return config
 
 

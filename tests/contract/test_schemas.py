@@ -97,7 +97,7 @@ def test_a_gateway_says_what_it_permits() -> None:
     device = PlainDevice(
         "mixer", (tag_of("mixer", "a", write=WriteRule()), tag_of("mixer", "b")), control=True
     )
-    other = PlainDevice("oven", (tag_of("oven", "c"),), blocks=True)
+    other = PlainDevice("oven", (tag_of("oven", "c"),), blocks=True, templates=("oven",))
     told = introspection(
         Keys("plant", "demo"),
         (device, other),
@@ -105,9 +105,10 @@ def test_a_gateway_says_what_it_permits() -> None:
         signed=True,
         history=False,
     )
+    plain = {"commands": [], "blocks": False, "templates": []}
     assert told["devices"] == {
-        "mixer": {"tags": 2, "writable": 1, "commands": ["run", "stop"], "blocks": False},
-        "oven": {"tags": 1, "writable": 0, "commands": [], "blocks": True},
+        "mixer": plain | {"tags": 2, "writable": 1, "commands": ["run", "stop"]},
+        "oven": plain | {"tags": 1, "writable": 0, "blocks": True, "templates": ["oven"]},
     }
     assert told["signed"]
     assert told["documents"]["value"] == {

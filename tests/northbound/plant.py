@@ -46,6 +46,7 @@ class PlainDevice:
     tags: tuple[Tag, ...]
     blocks: bool | Literal["only"] = False
     control: bool = False
+    templates: tuple[str, ...] = ()
 
 
 class PlainPlant:

@@ -44,7 +44,7 @@ class Bridge:
         self, session: zenoh.Session, prefix: str, space: int, core: Core, admission: Admission
     ) -> None:
         self.tree = Tree(space, prefix, self._value)
-        self.plant = RemotePlant(session, prefix, self._described, self._changed)
+        self.plant = RemotePlant(session, prefix, self._described, self._changed, self.tree.arrange)
         self.alarms = Alarms(
             session, prefix, self.plant.requests, self.tree, core.subscription_service
         )

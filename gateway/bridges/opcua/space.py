@@ -3,11 +3,12 @@
     Objects / plant / mixer / speed      ns=2;s=mixer/speed; folders are ns=2;s=/mixer/
     its properties                       ns=2;s=mixer/speed@unit, ns=2;s=mixer/speed@range
     its alarm                            ns=2;s=mixer/speed@alarm
+    devices by template                  ns=2;s=/@templates/mixer/
 
 20,000 tags of asyncua's own nodes would take 500 MB and a minute.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from asyncua import ua
@@ -19,7 +20,7 @@ from gateway.bridges.opcua.values import type_of
 Ids, Class = ua.ObjectIds, ua.NodeClass
 Attribute, Type, Level = ua.AttributeIds, ua.VariantType, ua.AccessLevel
 MOST_TAGS = 100_000
-ROOT = "/"
+ROOT, TEMPLATES = "/", "/@templates/"
 _COMPONENT, _PROPERTY = ua.NodeId(Ids.HasComponent), ua.NodeId(Ids.HasProperty)
 _ORGANIZES, _CONDITION = ua.NodeId(Ids.Organizes), ua.NodeId(Ids.HasCondition)
 _KINDS = {
@@ -42,6 +43,7 @@ class Tree:
         self.watched: dict[str, dict[int, Callable[..., Any]]] = {}
         self._below: dict[str, dict[str, None]] = {ROOT: {}}  # folders: the ids in them
         self._listed: dict[str, list[ua.ReferenceDescription]] = {}  # of folders
+        self._templates: dict[str, Sequence[str]] = {}  # of devices
 
     def node_id(self, name: str) -> ua.NodeId:
         return ua.NodeId(name, self.space)
@@ -55,6 +57,17 @@ class Tree:
         self._below[folder][key] = None
         self._listed.pop(folder, None)
         return True
+
+    def arrange(self, templates: Mapping[str, Sequence[str]]) -> None:
+        """Puts the folder of each device also below those of its templates. A device that is not
+        given stays where it was."""
+        self._templates |= {one: of for one, of in templates.items() if f"/{one}/" in self._below}
+        self._below = {k: v for k, v in self._below.items() if not k.startswith(TEMPLATES)}
+        self._below[ROOT].pop(TEMPLATES, None)
+        self._listed.clear()
+        for device, names in self._templates.items():
+            for name in names:
+                self._below[self._folder(f"{TEMPLATES[1:]}{name}/")][f"/{device}/"] = None
 
     def add_alarm(self, alarm: str) -> ua.NodeId:
         """Returns the node of an alarm, which is new or not."""
@@ -106,7 +119,8 @@ class Tree:
         return "property" if found is not None and about in properties(found) else None
 
     def attributes(self, name: str, kind: str) -> _Fields:
-        shown = self._called if name == ROOT else name.strip("/").rpartition("/")[2]
+        special = {ROOT: self._called, TEMPLATES: "ByTemplate"}
+        shown = special.get(name) or name.strip("/").rpartition("/")[2]
         space = self.space
         key, _, about = name.rpartition("@")
         if kind == "property":

@@ -94,10 +94,14 @@ _OWN = {"use", "repeat"}
 def expanded(file: YamlFile, mistakes: Mistakes, folder: FilePath) -> Mapping[str, Any]:
     """Returns the data without templates; that of a file without templates is not touched.
 
+    `use` of a device is the list of the templates that it had.
+
     `mistakes` gets the places of the expanded data.
     """
     data = file.data
-    if not any(name in data for name in SECTIONS) and not any(_uses(data)):
+    if not any(name in data for name in SECTIONS) and not any(
+        "use" in device for device in devices_in(data)
+    ):
         return data
     places = Expanded(file)
     mistakes.places = places
@@ -108,13 +112,14 @@ def expanded(file: YamlFile, mistakes: Mistakes, folder: FilePath) -> Mapping[st
     return rest
 
 
-def _uses(data: Values) -> Iterator[bool]:
+def devices_in(data: Values) -> Iterator[dict[str, Any]]:
+    """Yields the settings of every device of a file."""
     for line in _entries(data.get("lines")).values():
         for device in _entries(_entries(line).get("devices")).values():
-            yield "use" in _entries(device)
+            yield _entries(device)
 
 
-def _entries(raw: object) -> Values:
+def _entries(raw: object) -> dict[str, Any]:
     return raw if isinstance(raw, dict) else {}
 
 
@@ -190,7 +195,9 @@ class _Expansion:
         if values is not None:
             self._merge(found, self._filled(rest, values, at), at, place)
         self._check(rest, found.get("protocol"), templates, at)
+        names = own["use"] if isinstance(own["use"], list) else [own["use"]]
         tags = found.pop("tags", None)
+        found = {"use": names, **found}
         return found if tags is None else {**found, "tags": tags}
 
     def _values(

@@ -38,6 +38,7 @@ def introspection(
                 "writable": sum(tag.write is not None for tag in tags),
                 "commands": sorted(commands.get(device.name, ())) if device.control else [],
                 "blocks": bool(device.blocks),
+                "templates": list(device.templates),
             }
             for device in devices
         },

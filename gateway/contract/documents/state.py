@@ -356,12 +356,14 @@ class ServedKey(TypedDict):
 
 
 class ServedDevice(TypedDict):
-    """`commands`: those that the file permits; `writable`: the number of tags with `write`."""
+    """`commands`: those that the file permits; `writable`: the number of tags with `write`;
+    `templates`: that the device uses."""
 
     tags: int
     writable: int
     commands: list[str]
     blocks: bool
+    templates: list[str]
 
 
 class IntrospectDocument(TypedDict):

@@ -23,6 +23,7 @@ class DeviceSettings:
     blocks: bool | Literal["only"] = False  # one put per scan: also, or instead of one per tag
     control: bool = False  # run, stop, ... are allowed
     listen_only: bool = False  # another master asks it; nothing is ever sent
+    templates: tuple[str, ...] = ()  # that it uses: for clients
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
     targets: tuple[Tag, ...] = ()  # that only transfers write: no poll, no value
