@@ -138,18 +138,18 @@ class OpcuaClient:
         self.watched: dict[str, object] = {}
         self.read: dict[str, object] = {}
         self._url, self._folder = url, folder
-        self._loop = asyncio.new_event_loop()
+        self._has_begun = threading.Event()
         self._client: UaClient | None = None
         self._is_over = False
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._run(),))
+        self._thread = threading.Thread(target=asyncio.run, args=(self._run(),))
         self._thread.start()
 
     def kill(self) -> None:
         """Ends as a killed program does: the session stays open in the server."""
         if self._thread.is_alive():
+            self._has_begun.wait()
             self._loop.call_soon_threadsafe(self._drop)
             self._thread.join()
-            self._loop.close()
 
     def _drop(self) -> None:
         self._is_over = True
@@ -157,6 +157,8 @@ class OpcuaClient:
             self._client.disconnect_socket()
 
     async def _run(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._has_begun.set()
         while not self._is_over:
             with suppress(OSError, TimeoutError, ua.UaError, asyncio.CancelledError):
                 await self._watch()

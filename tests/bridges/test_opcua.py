@@ -6,6 +6,7 @@ import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -213,10 +214,67 @@ def test_an_opc_ua_client_reads_a_gateway_and_its_history(plant: Plant, tmp_path
         assert last[::-1][: len(whole)] == whole
         assert plant.ask("history", recipe, 60, 0) == {"status": "BadHistoryOperationUnsupported"}
 
+        _aggregates_are_those_of_the_values(plant, whole)
+
         gateway.end(signal.SIGKILL)
         until(lambda: plant.status("mixer/speed") == "BadNoCommunication", "it is bad")
         assert plant.ask("history", speed, 60, 0) == {"status": "BadNoCommunication"}
         assert plant.ask("write", recipe, "Int16", 8) == "BadNoCommunication"
+
+
+def _aggregates_are_those_of_the_values(plant: Plant, raw: list[dict[str, Any]]) -> None:
+    """Each aggregate of intervals of 300 ms, calculated here from the raw values."""
+    good = [(_ms(one["time"]), one["value"]) for one in raw if one["status"] == "GoodEdited"]
+    start, end = int(good[0][0]) + 1, int(good[-1][0]) - 1  # inside: the first one is valid
+    expected = [_expected(good, at, min(at + 300, end)) for at in range(start, end, 300)]
+    assert len(expected) > 1
+    for name in expected[0]:
+        found = plant.ask("aggregate", node("mixer/speed"), name, _iso(start), _iso(end), 300)
+        assert [_ms(one["time"]) for one in found] == [*range(start, end, 300)]
+        for one, wanted in zip(found, expected, strict=True):
+            if wanted[name] is None:
+                assert one["status"] == "BadNoData"
+            else:
+                rounded = 0.01 + (wanted["Range2"] or 0) / 100  # the client has milliseconds
+                assert one["value"] == pytest.approx(wanted[name], abs=rounded), (name, one)
+                assert one["status"].startswith("Good")
+    ask = "aggregate", node("mixer/speed")
+    assert plant.ask(*ask, "Total", _iso(start), _iso(end), 300) == {
+        "status": "BadAggregateNotSupported"
+    }
+    assert plant.ask(*ask, "Count", _iso(end), _iso(start), 300) == {"status": "BadInvalidArgument"}
+    functions = plant.ask("browse", "i=11201")
+    assert {"ns=0;i=2342", "ns=0;i=11285"} <= set(functions)
+
+
+def _expected(good: list[tuple[float, float]], start: int, end: int) -> dict[str, float | None]:
+    inside = [value for at, value in good if start <= at < end]
+    held = [(max(at, start), value) for at, value in good if at < end]
+    held = held[-len(inside) - 1 :]  # with the value that was valid at the beginning
+    ends = [at for at, _ in held[1:]] + [end]
+    valid = [value for (at, value), until_ in zip(held, ends, strict=True) if until_ > at]
+    area = sum(value * (until_ - at) for (at, value), until_ in zip(held, ends, strict=True))
+    return {
+        "TimeAverage2": area / (end - start),
+        "Minimum2": min(valid),
+        "Maximum2": max(valid),
+        "Range2": max(valid) - min(valid),
+        "Count": len(inside),
+        "PercentGood": 100,
+        "DurationGood": end - start,
+        "DurationBad": 0,
+        "Average": sum(inside) / len(inside) if inside else None,
+        "Minimum": min(inside, default=None),
+        "Maximum": max(inside, default=None),
+    }
+
+
+def _ms(time: str) -> float:
+    return datetime.fromisoformat(time).timestamp() * 1000
+
+
+def _iso(ms: float) -> str:
+    return datetime.fromtimestamp(ms / 1000, UTC).isoformat(timespec="milliseconds")
 
 
 def _alarm_is_acknowledged(plant: Plant) -> None:

@@ -30,7 +30,9 @@ MINUTE = 60 * SECOND
 ALWAYS = TimeRange(EARLIEST, LATEST)
 
 
-def plain(steps: Sequence[Step], width: int, period: TimeRange, now: int) -> list[dict[str, Any]]:
+def plain(
+    steps: Sequence[Step], width: int, period: TimeRange, now: int, from_start: bool = False
+) -> list[dict[str, Any]]:
     """The same buckets, each by looking at all samples."""
     if not steps:
         return []
@@ -38,7 +40,8 @@ def plain(steps: Sequence[Step], width: int, period: TimeRange, now: int) -> lis
     inside = [step for step in steps if first <= step[0] <= period.last]
     stop = min(period.last + 1, max([now, *(time + 1 for time, _, _ in inside)]))
     found = []
-    for begin in range(first // width * width, stop, width) if stop > first else ():
+    origin = first if from_start else first // width * width
+    for begin in range(origin, stop, width) if stop > first else ():
         start, end = max(begin, first), min(begin + width, stop)
         here = [s for s in inside if start <= s[0] < end and s[2] != NOT_RECORDED]
         valid: list[tuple[Any, int]] = [(value, 0) for _, value, _ in here if value is not None]
@@ -113,14 +116,23 @@ STEPS = st.lists(st.tuples(st.integers(0, 400), VALUES), max_size=25)
     st.one_of(st.none(), st.integers(-50, 450)),
     st.one_of(st.none(), st.integers(-50, 450)),
     st.integers(-100, 500),
+    st.booleans(),
 )
 def test_buckets_are_those_of_a_plain_aggregation(
-    found: list[tuple[int, Any]], width: int, first: int | None, last: int | None, now: int
+    found: list[tuple[int, Any]],
+    width: int,
+    first: int | None,
+    last: int | None,
+    now: int,
+    from_start: bool,
 ) -> None:
     found.sort(key=lambda step: step[0])
     steps: list[Step] = [(t, v, "no-reply" if v is None else None) for t, v in found]
     period = TimeRange(EARLIEST if first is None else first, LATEST if last is None else last)
-    compare([*buckets(steps, width, period, now)], plain(steps, width, period, now))
+    compare(
+        [*buckets(steps, width, period, now, from_start=from_start)],
+        plain(steps, width, period, now, from_start),
+    )
 
 
 def test_an_hour_of_two_values_and_a_gap() -> None:
@@ -352,6 +364,8 @@ def test_parameters() -> None:
             "_time=[..];bucket=1m;agg=min,avg",
             "agg=min,avg: 'avg' is none of min, max, mean, last",
         ),
+        ("_time=[..];align=start", "align=start needs a bucket, such as bucket=1min"),
+        ("_time=[..];bucket=1m;align=end", "align=end is neither start nor utc"),
         ("last=0", "last=0 is no count from 1 to 100000"),
         ("last=many", "last=many is no count from 1 to 100000"),
         ("last=5;limit=5", "last and limit exclude each other: send one of them"),

@@ -11,6 +11,7 @@
 //     start …  /  written         the same write in the background; waits for its status code
 //     history ns=2;s=mixer/speed SECONDS COUNT [back|last]   of the last seconds; `back`: the newest
 //                                            first; `last`: the newest first, without a start
+//     aggregate ns=2;s=mixer/speed NAME FROM TO MS   values by interval: [value, status, time]
 //     alarms                      prints `alarm NAME ACTIVE ACKED SEVERITY QUALITY` from now on
 //     acknowledge ns=2;s=mixer/level@alarm   its last event: the status code
 //     watch ns=2;s=mixer/speed    prints `changed ns=2;s=mixer/speed STATUS VALUE` from now on
@@ -95,6 +96,14 @@ async function history(session, nodeId, seconds, count, order) {
     return { status: "Good", parts, values };
 }
 
+async function aggregate(session, nodeId, name, from, to, interval) {
+    const result = await session.readAggregateValue(
+        { nodeId }, new Date(from), new Date(to), ua.AggregateFunction[name], Number(interval)
+    );
+    if (result.statusCode.isNot(ua.StatusCodes.Good)) return { status: result.statusCode.name };
+    return result.historyData.dataValues.map(shown);
+}
+
 async function watch(session, nodeId) {
     const subscription = await session.createSubscription2({
         requestedPublishingInterval: 50,
@@ -175,6 +184,7 @@ async function main(folder) {
         watch,
         alarms,
         acknowledge,
+        aggregate,
         connect: async (_, endpointUrl, mode = "None", userName = null, password = null) => {
             client = create(mode);
             try {

@@ -1,16 +1,19 @@
-"""HistoryRead: raw values from the history of the gateways."""
+"""HistoryRead: raw values and aggregates from the history of the gateways."""
 
 import json
 from datetime import UTC, datetime, timedelta
 
 import zenoh
 from asyncua import ua
+from asyncua.common.utils import ServiceError
 from asyncua.server.history import HistoryManager
 from asyncua.server.internal_server import InternalServer
 
 from gateway.bridges.documents import Known, copied
+from gateway.bridges.opcua.aggregates import Aggregates
 from gateway.bridges.opcua.values import data_value, type_of
 from gateway.bridges.remote_plant import RemotePlant
+from gateway.errors import GatewayError
 
 STEP = timedelta(microseconds=1)
 MOST_SAMPLES = 10_000  # in one answer; the client gets the rest with the continuation point
@@ -21,21 +24,35 @@ def _text(time: datetime | None) -> str:
 
 
 class History(HistoryManager):
-    """Answers HistoryRead of raw values from the history of the gateway."""
+    """Answers HistoryRead from the history of the gateway."""
 
     def __init__(self, iserver: InternalServer, plant: RemotePlant) -> None:
         super().__init__(iserver)
-        self._plant = plant
+        self._plant, self._aggregates = plant, Aggregates(plant)
 
     async def read_history(self, params: ua.HistoryReadParameters) -> list[ua.HistoryReadResult]:
-        results = []
-        for item in params.NodesToRead:
+        results, details = [], params.HistoryReadDetails
+        wanted: list[ua.NodeId | None] = [None] * len(params.NodesToRead)
+        if isinstance(details, ua.ReadProcessedDetails):
+            if len(details.AggregateType or ()) != len(wanted):
+                raise ServiceError(ua.StatusCodes.BadAggregateListMismatch)
+            wanted = list(details.AggregateType)
+        for item, aggregate in zip(params.NodesToRead, wanted, strict=True):
             result = ua.HistoryReadResult(HistoryData=ua.HistoryData())
             try:
-                values, rest = await self._history(params.HistoryReadDetails, item)
-                result.HistoryData.DataValues, result.ContinuationPoint = values, rest
+                if not self._plant.tags.get(item.NodeId.Identifier, {}).get("history"):
+                    raise ua.uaerrors.BadHistoryOperationUnsupported
+                if aggregate is None:
+                    found = await self._history(details, item)
+                else:
+                    found = await self._aggregates.read(details, aggregate, item)
+                result.HistoryData.DataValues, result.ContinuationPoint = found
             except ua.UaStatusCodeError as error:
                 result.StatusCode = ua.StatusCode(error.code)
+            except GatewayError:
+                result.StatusCode = ua.StatusCode(ua.StatusCodes.BadNoCommunication)
+            except (ValueError, LookupError, TypeError):  # of another program
+                result.StatusCode = ua.StatusCode(ua.StatusCodes.BadCommunicationError)
             results.append(result)
         return results
 
@@ -45,8 +62,6 @@ class History(HistoryManager):
         """Returns samples and a continuation point: the time of the next one."""
         key = item.NodeId.Identifier
         if not isinstance(details, ua.ReadRawModifiedDetails) or details.IsReadModified:
-            raise ua.uaerrors.BadHistoryOperationUnsupported
-        if not self._plant.tags.get(key, {}).get("history"):
             raise ua.uaerrors.BadHistoryOperationUnsupported
         start, end = (
             None if time is None or time <= ua.get_win_epoch() else time.astimezone(UTC)

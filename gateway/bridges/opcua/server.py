@@ -15,6 +15,7 @@ from asyncua import Server, ua
 from gateway import __version__
 from gateway.bridges.opcua import wire
 from gateway.bridges.opcua.admission import MOST_OPERATIONS, Admission, Quiet
+from gateway.bridges.opcua.aggregates import NAMES
 from gateway.bridges.opcua.bridge import Bridge
 from gateway.bridges.opcua.browsing import MOST_POINTS
 from gateway.bridges.opcua.history import History
@@ -38,6 +39,12 @@ _LIMIT_OF = {
     **dict.fromkeys(("HistoryReadData", "MethodCall"), 100),
     **dict.fromkeys(("HistoryReadEvents", "NodeManagement"), 0),
 }
+
+_AGGREGATES = (
+    ua.ObjectIds.Server_ServerCapabilities_AggregateFunctions,
+    ua.ObjectIds.HistoryServerCapabilities_AggregateFunctions,
+)
+_HAS_HISTORY = ua.NodeId(ua.ObjectIds.HistoryServerCapabilities_AccessHistoryDataCapability)
 
 
 class Options(NamedTuple):
@@ -154,6 +161,10 @@ async def _describe(server: Server, options: Options, prefix: str) -> int:
     for name, most in _LIMIT_OF.items():
         node = server.get_node(ua.NodeId(getattr(ua.ObjectIds, f"{_LIMITS}{name}")))
         await node.write_value(ua.Variant(most, ua.VariantType.UInt32))
+    for aggregate in NAMES:
+        for list_ in _AGGREGATES:
+            await server.get_node(ua.NodeId(list_)).add_reference(aggregate, ua.ObjectIds.Organizes)
+    await server.get_node(_HAS_HISTORY).write_value(True)
     points = ua.NodeId(ua.ObjectIds.Server_ServerCapabilities_MaxBrowseContinuationPoints)
     await server.get_node(points).write_value(ua.Variant(MOST_POINTS, ua.VariantType.UInt16))
     return int(await server.register_namespace(f"urn:zenoh-plc-gateway:{prefix}"))

@@ -15,7 +15,7 @@ from asyncua import ua
 from asyncua.server.address_space import AddressSpace, AttributeValue, NodeData
 
 from gateway.bridges.documents import Known
-from gateway.bridges.opcua.values import type_of
+from gateway.bridges.opcua.attributes import PROPERTIES, Fields, int32, of_tag, properties, variable
 
 Ids, Class = ua.ObjectIds, ua.NodeClass
 Attribute, Type, Level = ua.AttributeIds, ua.VariantType, ua.AccessLevel
@@ -30,7 +30,6 @@ _KINDS = {
     "property": ua.NodeId(Ids.PropertyType),
     "alarm": ua.NodeId(Ids.AlarmConditionType),
 }
-_Fields = dict[int, ua.Variant]  # by attribute
 
 
 class Tree:
@@ -118,17 +117,17 @@ class Tree:
         found = self.tags.get(key)
         return "property" if found is not None and about in properties(found) else None
 
-    def attributes(self, name: str, kind: str) -> _Fields:
+    def attributes(self, name: str, kind: str) -> Fields:
         special = {ROOT: self._called, TEMPLATES: "ByTemplate"}
         shown = special.get(name) or name.strip("/").rpartition("/")[2]
         space = self.space
         key, _, about = name.rpartition("@")
         if kind == "property":
-            shown, space = _PROPERTIES[about], 0
+            shown, space = PROPERTIES[about], 0
         is_variable = kind in ("tag", "item", "property")
         found = {
             Attribute.NodeId: ua.Variant(self.node_id(name), Type.NodeId),
-            Attribute.NodeClass: _int32(Class.Variable if is_variable else Class.Object),
+            Attribute.NodeClass: int32(Class.Variable if is_variable else Class.Object),
             Attribute.BrowseName: ua.Variant(ua.QualifiedName(shown, space), Type.QualifiedName),
             Attribute.DisplayName: ua.Variant(ua.LocalizedText(shown), Type.LocalizedText),
             Attribute.WriteMask: ua.Variant(0, Type.UInt32),
@@ -139,19 +138,8 @@ class Tree:
         if kind == "property":
             value = properties(self.tags[key])[about]
             data_type = ua.NodeId(Ids.EUInformation if about == "unit" else Ids.Range)
-            return found | {Attribute.Value: value} | _variable(data_type, Level.CurrentRead.mask)
-        return found | self._of_tag(self.tags[name])
-
-    def _of_tag(self, meta: Known) -> _Fields:
-        access = Level.CurrentRead.mask
-        if meta["write"]:
-            access |= Level.CurrentWrite.mask
-        if meta["history"]:
-            access |= Level.HistoryRead.mask
-        text = ua.LocalizedText(meta["description"])
-        data_type = ua.NodeId(type_of(meta).value)
-        found = _variable(data_type, access, meta.get("length"), bool(meta["history"]))
-        return found | {Attribute.Description: ua.Variant(text, Type.LocalizedText)}
+            return found | {Attribute.Value: value} | variable(data_type, Level.CurrentRead.mask)
+        return found | of_tag(self.tags[name])
 
     def value(self, name: str) -> AttributeValue:
         """Returns the value of a tag, and the clients that watch it."""
@@ -268,42 +256,5 @@ def plant_into(aspace: AddressSpace, tree: Tree) -> None:
     aspace[_OBJECTS].references.append(tree._child(ROOT, _ORGANIZES))
 
 
-def properties(meta: Known) -> dict[str, ua.Variant]:
-    """Returns the properties of a tag: `unit`, and `range` where both ends are known."""
-    found = {}
-    if unit := meta["unit"]:
-        shown = ua.LocalizedText(unit)
-        about = ua.EUInformation("urn:zenoh-plc-gateway", -1, shown, shown)
-        found["unit"] = ua.Variant(about, Type.ExtensionObject)
-    for limits in (meta["write"], meta.get("clamp"), meta.get("range")):
-        low, high = (limits or {}).get("min"), (limits or {}).get("max")
-        if low is not None and high is not None:
-            found["range"] = ua.Variant(ua.Range(Low=low, High=high), Type.ExtensionObject)
-            break
-    return found
-
-
-_PROPERTIES = {"unit": "EngineeringUnits", "range": "EURange"}
 _TYPE_OF = ua.NodeId(Ids.HasTypeDefinition)
 _OBJECTS = ua.NodeId(Ids.ObjectsFolder)
-
-
-def _variable(
-    data_type: ua.NodeId, access: int, length: int | None = None, historizing: bool = False
-) -> _Fields:
-    rank = ua.ValueRank.Scalar if length is None else ua.ValueRank.OneDimension
-    found = {
-        Attribute.DataType: ua.Variant(data_type, Type.NodeId),
-        Attribute.ValueRank: _int32(rank),
-        Attribute.AccessLevel: ua.Variant(access, Type.Byte),
-        Attribute.UserAccessLevel: ua.Variant(access, Type.Byte),
-        Attribute.MinimumSamplingInterval: ua.Variant(0.0, Type.Double),
-        Attribute.Historizing: ua.Variant(historizing, Type.Boolean),
-    }
-    if length is not None:
-        found[Attribute.ArrayDimensions] = ua.Variant([length], Type.UInt32, is_array=True)
-    return found
-
-
-def _int32(value: int) -> ua.Variant:
-    return ua.Variant(int(value), Type.Int32)

@@ -136,9 +136,16 @@ class _Open:
 
 
 def buckets(
-    steps: Iterable[Step], width: int, period: TimeRange, now: int, most: int = MOST_BUCKETS
+    steps: Iterable[Step],
+    width: int,
+    period: TimeRange,
+    now: int,
+    most: int = MOST_BUCKETS,
+    *,
+    from_start: bool = False,
 ) -> Iterator[Bucket]:
-    """Divides the period into buckets of `width` ns, which begin at multiples of it since 1970.
+    """Divides the period into buckets of `width` ns, which begin at multiples of it since 1970, or
+    since the start of the period.
 
     `steps` are in the order of time; those before the period tell the value at its beginning. An
     open period begins with the first step, and every period ends with `now` or the last step.
@@ -154,7 +161,9 @@ def buckets(
             begun = True
             begin = since = time if first == EARLIEST else first
             _check(since, min(last, max(now, time)), width, most)
-            bucket, end = _Open(since // width * width, since), (since // width + 1) * width
+            offset = since % width if from_start else 0
+            begins = (since - offset) // width * width + offset
+            bucket, end = _Open(begins, since), begins + width
         if time > last:
             break
         while time >= end:

@@ -1,7 +1,8 @@
 """The parameters of a query of the past, for Zenoh and HTTP alike.
 
-`bucket=1min` divides the time, `agg=min,max,mean,last` chooses the values of each bucket.
-`last=100` asks for the newest samples. `quality=good` leaves out what is not good.
+`bucket=1min` divides the time, `agg=min,max,mean,last` chooses the values of each bucket,
+`align=start` begins the first one with the range. `last=100` asks for the newest samples.
+`quality=good` leaves out what is not good.
 """
 
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ from gateway.errors import BadValue
 
 AGGREGATES = ("min", "max", "mean", "last")
 MOST_LAST = 100_000  # samples of one tag
-NAMES = ("bucket", "agg", "last", "quality")
+NAMES = ("bucket", "agg", "align", "last", "quality")
 _ALSO = ("limit", "page", "after")
 _OF_PAST = ("_time", "bucket", "last")
 _LONGEST = 36500 * 86400 * 10**9  # ns
@@ -28,13 +29,15 @@ class Parameters(Protocol):
 
 
 class HistoryQuery(NamedTuple):
-    """`bucket`: ns, None for samples. `last`: the newest samples, None for all."""
+    """`bucket`: ns, None for samples. `last`: the newest samples, None for all. `from_start`:
+    the first bucket begins with the range."""
 
     time_range: str
     bucket: int | None = None
     aggregates: tuple[str, ...] = AGGREGATES
     last: int | None = None
     only_good: bool = False
+    from_start: bool = False
 
 
 def is_of_past(parameters: Parameters) -> bool:
@@ -46,11 +49,16 @@ def question(parameters: Mapping[str, str], time: str = "_time") -> HistoryQuery
     """Parses the parameters; `time` names the one of the range. Raises `BadValue`."""
     _check_names(parameters, time)
     bucket, agg, last = (parameters.get(name) for name in ("bucket", "agg", "last"))
+    align = parameters.get("align", "utc")
     quality = parameters.get("quality", "any")
     if quality not in ("good", "any"):
         raise BadValue(f"quality={quality[:40]} is neither good nor any")
-    if agg is not None and bucket is None:
-        raise BadValue(f"agg={agg[:40]} needs a bucket, such as bucket=1min")
+    for name in ("agg", "align"):
+        if name in parameters and bucket is None:
+            given = parameters[name][:40]
+            raise BadValue(f"{name}={given} needs a bucket, such as bucket=1min")
+    if align not in ("start", "utc"):
+        raise BadValue(f"align={align[:40]} is neither start nor utc")
     if bucket is not None and time not in parameters:
         raise BadValue(f"bucket={bucket[:40]} needs a range of time, such as {time}=[now(-1h)..]")
     asked = [name for name in ("bucket", "last", "limit", "page") if name in parameters]
@@ -62,6 +70,7 @@ def question(parameters: Mapping[str, str], time: str = "_time") -> HistoryQuery
         AGGREGATES if agg is None else _aggregates(agg),
         None if last is None else _last(last),
         quality == "good",
+        align == "start",
     )
 
 

@@ -135,7 +135,10 @@ class Historian:
         if width is None:
             raise BadValue("a bucket is missing, such as bucket=1min")
         period = self._range(question.time_range, None, now.time)
-        return _readable(self._course.buckets(tag, period, width, now, pause))
+        of_tag = self._course.buckets(
+            tag, period, width, now, pause, from_start=question.from_start
+        )
+        return _readable(of_tag)
 
     def newest(
         self, tag: Tag, question: HistoryQuery, now: int, pause: Callable[[], None]

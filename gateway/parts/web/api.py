@@ -80,6 +80,7 @@ _QUESTION = (
     _SAMPLES,
     Word("bucket", "Length of a bucket such as 1min: see docs/charts.md"),
     Word("agg", "Values of each bucket: min,max,mean,last if left out"),
+    Choice("align", "start: the first bucket begins with the range", ("utc", "start")),
     Count("last", "The newest samples of the range", 1, MOST_SAMPLES),
     Choice("quality", "good leaves out samples and buckets that are not good", ("any", "good")),
 )

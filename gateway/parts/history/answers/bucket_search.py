@@ -46,7 +46,14 @@ class BucketSearch:
     _most: int = MOST_BUCKETS
 
     def buckets(
-        self, tag: Tag, period: TimeRange, width: int, now: Now, pause: Pause
+        self,
+        tag: Tag,
+        period: TimeRange,
+        width: int,
+        now: Now,
+        pause: Pause,
+        *,
+        from_start: bool = False,
     ) -> Iterator[Bucket]:
         """Yields the buckets of a tag. Raises `BadValue`, `Busy`, and at the end `Damaged`."""
         file, runs, newest = self._recent.find(tag.recorded_key)
@@ -63,7 +70,7 @@ class BucketSearch:
                 begin = begin[0], None, DAMAGED
         parts += [_in_memory(samples) for run in newest if (samples := _steps_of(run, period))]
         steps = _with_gaps(begin, _merged(parts), look, now)
-        yield from buckets(steps, width, period, now.time, self._most)
+        yield from buckets(steps, width, period, now.time, self._most, from_start=from_start)
         if (lost := stored.lost()) is not None:
             raise lost
 
