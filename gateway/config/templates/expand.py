@@ -94,14 +94,11 @@ _OWN = {"use", "repeat"}
 def expanded(file: YamlFile, mistakes: Mistakes, folder: FilePath) -> Mapping[str, Any]:
     """Returns the data without templates; that of a file without templates is not touched.
 
-    `use` of a device is the list of the templates that it had.
-
-    `mistakes` gets the places of the expanded data.
+    `use` of a device is the list of the templates that it had. `mistakes` gets the places of the expanded data.
     """
     data = file.data
-    if not any(name in data for name in SECTIONS) and not any(
-        "use" in device for device in devices_in(data)
-    ):
+    uses = any("use" in device for device in devices_in(data))
+    if not uses and not any(name in data for name in SECTIONS):
         return data
     places = Expanded(file)
     mistakes.places = places
