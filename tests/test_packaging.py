@@ -1,4 +1,4 @@
-"""The files of packaging/: systemd, container, Kubernetes, certificates."""
+"""The files of packaging/: systemd, container, Kubernetes."""
 
 import re
 import subprocess
@@ -12,7 +12,7 @@ from tests.conftest import needs
 from tests.e2e.processes import ROOT
 
 PACKAGING = ROOT / "packaging"
-UNITS = ("plc-gateway@", "plc-gateway-bridge@")
+UNITS = ("plc-gateway@", "plc-gateway-bridge@", "plc-gateway-renew@", "plc-gateway-ca")
 DOCKERFILE = ROOT / "Dockerfile"
 WORST = 30  # tenths, of `systemd-analyze security`
 
@@ -28,7 +28,7 @@ def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     own = (PACKAGING / f"systemd/{request.param}.service").read_text()
     text, count = re.subn(r"(?<=ExecStart=)/opt/\S+", "/bin/true", own)
     assert count == 1
-    file = tmp_path / f"{request.param}hall.service"
+    file = tmp_path / f"{request.param.replace('@', '@hall')}.service"
     file.write_text(text)
     return file
 
@@ -103,27 +103,3 @@ def test_the_pod_writes_to_its_volume_only_and_is_probed(tmp_path: Path) -> None
         assert command == ["plc-gateway", "health", "/etc/plc-gateway/config.yaml"]
     # A probe that needs a router would restart the gateway when the router is away.
     assert loaded.zenoh.listen == ("tcp/127.0.0.1:7447",)
-
-
-def certificates(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    needs("openssl")
-    command = [str(PACKAGING / "certificates"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["client", "DIR", "scada"], "first run certificates ca"),
-        (["client", "DIR"], "name the client"),
-        (["gateway", "DIR", "../x"], "use letters, digits"),
-        (["server", "DIR", "x"], "there is no"),
-        ([], "usage"),
-    ],
-)
-def test_the_script_for_certificates_names_mistakes(
-    tmp_path: Path, arguments: list[str], says: str
-) -> None:
-    done = certificates(*(tmp_path if word == "DIR" else word for word in arguments))
-    assert done.returncode == 2
-    assert says in done.stderr

@@ -40,6 +40,8 @@ _COMMANDS = {
     "health": "status:health",
     "fleet": "fleet.command:fleet",
     "remote": "fleet.remote:remote",
+    "ca": "certificates.command:cli",
+    "enrol": "certificates.command:enrol",
     "line": "line.shared:line",
     "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",

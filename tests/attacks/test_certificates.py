@@ -1,4 +1,4 @@
-"""The certificates of packaging/certificates: a gateway and a client accept each other by them."""
+"""The certificates of `plc-gateway ca`: a gateway and a client accept each other by them."""
 
 import base64
 import contextlib
@@ -7,34 +7,39 @@ import os
 import signal
 import socket
 import ssl
-import subprocess
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.cli.certificates import signing
+from gateway.cli.certificates.authority import Authority, create
+from gateway.cli.certificates.signing import Holder, Pair
 from gateway.contract.access.certificates import expires
 from gateway.contract.faults import faults
 from gateway.errors import ConfigError
-from tests.conftest import needs
 from tests.e2e.processes import (
-    ROOT,
     free_port,
+    gateway,
     plc_gateway,
     started,
     until,
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import configured, free_endpoint
 
 
-def certificates(*arguments: object, **environment: object) -> None:
-    needs("openssl")
-    command = [str(ROOT / "packaging/certificates"), *map(str, arguments)]
-    changed = {name: str(value) for name, value in environment.items()}
-    subprocess.run(command, check=True, capture_output=True, env={**os.environ, **changed})
+def issued(folder: Path, holder: Holder, days: float = 825) -> None:
+    """Makes a key and a certificate, and an authority for them if there is none."""
+    if not (folder / "ca.key").exists():
+        create(folder, 3650)
+    Authority(folder).issue(holder, days)
 
 
 def greets(port: int, folder: Path, called: str, *, refused: bool = False) -> None:
@@ -55,10 +60,9 @@ def greets(port: int, folder: Path, called: str, *, refused: bool = False) -> No
 def test_gateway_and_clients_know_each_other_by_their_certificates(tmp_path: Path) -> None:
     plant, other = tmp_path / "plant", tmp_path / "other"
     for folder in (plant, other):
-        certificates("ca", folder)
-        certificates("client", folder, "scada")
+        issued(folder, Holder("scada", is_client=True))
     (other / "ca.pem").write_bytes((plant / "ca.pem").read_bytes())
-    certificates("gateway", plant, "gateway", "10.0.0.5", "gateway.plant")
+    issued(plant, Holder("gateway", ["10.0.0.5", "gateway.plant"]))
     endpoint = free_endpoint().replace("tcp/", "tls/")
     tls = {"ca": "plant/ca.pem", "certificate": "plant/gateway.pem", "key": "plant/gateway.key"}
     file = write_config(
@@ -84,7 +88,6 @@ def test_gateway_and_clients_know_each_other_by_their_certificates(tmp_path: Pat
 def _plant(folder: Path, days: int) -> tuple[Path, Path]:
     """Makes an authority, and a gateway whose certificate has `days`."""
     pki = folder / "pki"
-    certificates("ca", pki)
     _renew(pki, days)
     endpoint = free_endpoint().replace("tcp/", "tls/")
     tls = {"ca": "pki/ca.pem", "certificate": "pki/gateway.pem", "key": "pki/gateway.key"}
@@ -100,10 +103,8 @@ def _plant(folder: Path, days: int) -> tuple[Path, Path]:
 
 
 def _renew(pki: Path, days: int) -> None:
-    """Makes a new certificate, and puts it in the place of the old one."""
-    for name in ("gateway.pem", "gateway.key"):
-        (pki / name).unlink(missing_ok=True)
-    certificates("gateway", pki, "gateway", "127.0.0.1", DAYS=days)
+    """Makes a new certificate, in the place of the old one."""
+    issued(pki, Holder("gateway", ["127.0.0.1"]), days)
 
 
 def test_a_certificate_says_how_long_it_is_valid_and_is_renewed(tmp_path: Path) -> None:
@@ -131,6 +132,79 @@ def test_files_that_do_not_fit_each_other_are_not_taken_over(tmp_path: Path) -> 
         os.kill(program.pid, signal.SIGHUP)
         program.says("file reloaded")
         assert plc_gateway("health", file).code == 0
+        assert not program.has_said("gateway starts over")
+
+
+@contextlib.contextmanager
+def router(endpoint: str, pki: Path, *names: str) -> Iterator[zenoh.Session]:
+    """A router that closes links whose certificate has ended. Only `names` may do anything."""
+    tls = {
+        "root_ca_certificate": str(pki / "ca.pem"),
+        "listen_certificate": str(pki / "router.pem"),
+        "listen_private_key": str(pki / "router.key"),
+        "enable_mtls": True,
+        "close_link_on_expiration": True,
+    }
+    messages = ["put", "query", "reply", "declare_subscriber", "declare_queryable"]
+    rule = {"id": "all", "permission": "allow", "flows": ["ingress", "egress"]}
+    access: dict[str, Any] = {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [{**rule, "messages": messages, "key_exprs": ["**", "works/@gateway/**"]}],
+        "subjects": [{"id": "known", "cert_common_names": names}],
+        "policies": [{"rules": ["all"], "subjects": ["known"]}],
+    }
+    config = {"transport/link/tls": tls, "access_control": access}
+    setup = {"mode": "router", "listen": [endpoint], "connect": [], "config": config}
+    with zenoh.open(configured(setup)) as session:
+        yield session
+
+
+def test_a_gateway_that_connects_takes_its_renewed_certificate_without_a_start(
+    tmp_path: Path,
+) -> None:
+    """A link ends with its certificate, and the next one has the new one; a name that the router
+    does not list gets nothing."""
+    pki, endpoint = tmp_path / "pki", free_endpoint().replace("tcp/", "tls/")
+    issued(pki, Holder("router", ["127.0.0.1"]))
+    issued(pki, Holder("hall"))
+    own = signing.private_key_of((pki / "hall.key").read_bytes())
+    authority = Pair(
+        signing.certificate_of((pki / "ca.pem").read_bytes()),
+        signing.private_key_of((pki / "ca.key").read_bytes()),
+    )
+
+    def certify(name: str, days: float) -> None:
+        made = signing.signed(authority, Holder(name), own.public_key(), days)
+        (pki / "new").write_bytes(signing.pem(made))
+        (pki / "new").replace(pki / "hall.pem")
+
+    def answers(session: zenoh.Session) -> bool:
+        found = session.get("works/@gateway/demo/status", timeout=5)
+        return any(reply.ok is not None for reply in found)
+
+    tls = {"ca": "pki/ca.pem", "certificate": "pki/hall.pem", "key": "pki/hall.key"}
+    zenoh_section = {
+        "prefix": "works",
+        "mode": "client",
+        "listen": [],
+        "connect": [endpoint],
+        "tls": {**tls, "mutual": True},
+    }
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D1"}})}
+    file = write_config(tmp_path / "c.yaml", endpoint, lines, zenoh=zenoh_section)
+    with gateway("run", file) as program:
+        with router(endpoint, pki, "hall") as session:
+            program.says("Zenoh session ready")
+            until(lambda: answers(session), "hall answers")
+        certify("hall", 6 / 86_400)
+        with router(endpoint, pki, "press") as session:
+            ended = expires((pki / "hall.pem").read_bytes())
+            until(lambda: bool(session.info.links()) or time.time() > ended, "hall is linked")
+            assert not answers(session)
+            certify("press", 100)
+            until(lambda: answers(session), "press answers, on a new link")
+        program.says("link up")
         assert not program.has_said("gateway starts over")
 
 

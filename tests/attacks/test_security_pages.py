@@ -76,7 +76,7 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "this machine can read and write.": (DEFAULT,),
         "If it listens elsewhere without protection, it warns at every start:": (WARNS, MUTUAL),
         # Restrict connections
-        "By certificate:": (MUTUAL,),
+        "By [certificate](enrol.md):": (MUTUAL,),
         "With `mutual: true` every client needs a certificate that `ca` has signed.": (MUTUAL,),
         "Without it, the certificate only proves the identity of the gateway, and every client may "
         "connect.": (MUTUAL,),

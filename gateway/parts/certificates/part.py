@@ -34,13 +34,18 @@ class Looked:
 class CertificatePart:
     """The files of `zenoh.tls`, of lines and of doors.
 
-    Zenoh reads them when its session opens: with renewed files the gateway starts over, when they
-    are sound. Lines and doors read theirs again by themselves.
+    Zenoh reads them for each connection that it opens, but only once for those that it accepts: a
+    gateway that listens starts over with renewed files, when they are sound. Lines and doors read
+    theirs again by themselves.
     """
 
     def __init__(self, core: Core) -> None:
         self._core = core
         self._secured = core.config.secured
+        zenoh = core.config.zenoh
+        self._listens = zenoh.config_file is not None or any(
+            endpoint.startswith(("tls/", "quic/")) for endpoint in zenoh.listen
+        )
         self._opened_with: bytes | None = None
         self._looked = Looked(b"", {}, "")
 
@@ -60,7 +65,7 @@ class CertificatePart:
 
     async def _look_again(self) -> None:
         self._looked = found = await off_loop(_look, self._secured, within=LOOK_WITHIN)
-        if found.content != self._opened_with and not found.trouble:
+        if self._listens and found.content != self._opened_with and not found.trouble:
             self._core.start_over("the files of zenoh.tls were renewed")
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
