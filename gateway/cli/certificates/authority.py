@@ -238,7 +238,7 @@ class Authority:
             os.close(lock)
 
     def _take(self, lock: int) -> None:
-        """Raises `GatewayError` where another command holds the folder: it may have been stopped."""
+        """Raises `GatewayError` while another command holds the folder, which may stand still."""
         until = time.monotonic() + WAITS
         while True:
             try:
