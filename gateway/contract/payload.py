@@ -36,6 +36,7 @@ from gateway.contract.problems import PROBLEMS, Failure, Problem
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.sample import has_json
+from gateway.tags.scan import Samples
 from gateway.tags.tag import READ
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
@@ -125,10 +126,20 @@ def value(sample: Sample) -> bytes:
     return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time, origin, limited))
 
 
-def plain_value(known: Value, time: int) -> bytes | None:
-    """The good value of a plain tag, with quality and time. None: JSON has no such value."""
-    text = orjson.dumps(known)
-    return None if text == b"null" else b'{"value":%b%b' % (text, _end_of_good(time, None, None))
+def scan(samples: Samples) -> list[bytes | Sample]:
+    """The plain good values of a read, as `value`. A sample stays what has more than that."""
+    values, others = samples.plain()
+    text, end = orjson.dumps(values), _end_of_good(samples.time, None, None)
+    joint = b'%b\n{"value":' % end  # JSON has no line end within a value
+    found: list[bytes | Sample] = []
+    found += (b'{"value":%b%b' % (text[1:-1].replace(b",", joint), end)).split(b"\n")
+    if len(found) != len(samples):  # a comma within a value
+        return list(samples)
+    if b"null" in text:
+        others = [place for place, known in enumerate(values) if not has_json(known)]
+    for place in others:
+        found[place] = samples[place]
+    return found
 
 
 @lru_cache(maxsize=256)  # the samples of one scan share one time

@@ -22,8 +22,9 @@ from gateway.errors import Busy, GatewayError
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.group.admission import Admission
 from gateway.northbound.group.standby import GroupSettings
-from gateway.northbound.publishing.publisher import Publisher, ScanBatches
+from gateway.northbound.publishing.publisher import Publisher
 from gateway.northbound.publishing.republish import Republisher
+from gateway.northbound.publishing.scan_batches import ScanBatches
 from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.northbound.publishing.status_publisher import StatusPublisher
 from gateway.northbound.publishing.traces import Traces
@@ -39,7 +40,6 @@ from gateway.northbound.session.session_settings import configure, drop_limit, e
 from gateway.northbound.session.watchdog import Watchdog
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample, Tag, WriteResult
-from gateway.tags.scan import Samples
 from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -103,7 +103,7 @@ class Northbound:
         index = TagIndex(self.keys, plant.devices())
         self._admission = Admission(group, self.keys, self._config, index.names, plant.duty)
         losses = SlowPuts(drop_limit(self._config))
-        self._publisher = Publisher(self.keys, losses)
+        self._publisher = Publisher(self.keys, losses, index)
         self._batches = ScanBatches(self._publisher, index)
         self._republisher = Republisher(
             self._batches.publish,
@@ -133,14 +133,9 @@ class Northbound:
     # -- from the gateway --
 
     def publish(self, samples: Sequence[Sample]) -> None:
-        """Publishes one scan. Waits for no link; with many values for the thread, a moment.
-
-        The plant updates its own samples first. Samples of event tags all go out, in order, none
-        replaced by the next.
-        """
+        """Publishes one scan. Never blocks. The plant updates its own samples first. Samples of
+        event tags all go out, in order, none replaced by the next."""
         self._batches.publish(samples)
-        if isinstance(samples, Samples):  # good reads
-            self._publisher.pause(len(samples))
 
     def set_online(self, device: str, online: bool) -> None:
         """Declares or undeclares the device's liveliness token."""
@@ -219,9 +214,9 @@ class Northbound:
         """Claims these devices, and no others any more."""
         await self._admission.claiming.change(devices)
 
-    async def change(self, index: TagIndex, gone: Iterable[Tag]) -> None:
-        """Serves the devices of the plant as they are now. `gone`: tags that it had before."""
-        self._publisher.forget(self._incoming.become(index), gone)
+    async def change(self, index: TagIndex) -> None:
+        """Serves the devices of the plant as they are now."""
+        self._publisher.forget(self._incoming.become(index))
         if self.opened.is_set():
             await off_loop(self._incoming.changed)
             self._status.publish()

@@ -1,7 +1,6 @@
 """Decodes the reads of a block: only what changed, and makes samples only where they are needed."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from copy import copy
 from itertools import compress
 from operator import call, itemgetter, ne
 from typing import Any, overload
@@ -45,7 +44,7 @@ class Latest:
         self.by_rule = frozenset(eager).union(p for p, rule in rules if rule.deadband is not None)
         self.unasked = tuple(eager)
         self.alarmed = tuple(p for p, tag in places if tag.feature(AlarmRule) is not None)
-        self.named = frozenset(p for p, tag in places if not tag.is_plain)
+        self.named = frozenset(p for p, tag in places if not (tag.is_plain and tag.is_scalar))
         self.scan, self.in_use = scan, True
 
 
@@ -75,29 +74,20 @@ class Samples(Sequence[Sample]):
         return self._all()[index]
 
     @property
-    def block(self) -> int:
-        """A number of the block, while this is kept."""
-        return id(self._tags)
+    def tags(self) -> Sequence[Tag]:
+        tags, places = self._tags, self._places
+        return tags if len(places) == len(tags) else [tags[place] for place in places]
 
-    @property
-    def tags(self) -> list[Tag]:
-        return [self._tags[place] for place in self._places]
-
-    def parts(self) -> Iterator[Value | Sample]:
-        """Yields the good value of each tag that has a plain one, and the sample of others."""
+    def plain(self) -> tuple[list[Value | None], list[int]]:
+        """Returns the values, and the numbers of those that are more than a plain good one: None
+        is in their place."""
         values, special = self._values, self._named
         if self._failures or self._outside:
             special = special.union(self._failures, self._outside)
-        for number, place in enumerate(self._places):
-            value = values[place]
-            yield self[number] if value is None or place in special else value
-
-    def without(self, gone: Collection[Tag]) -> "Samples":
-        """Returns the same samples without those of some tags."""
-        rest = copy(self)
-        rest._places = [place for place in self._places if self._tags[place] not in gone]
-        rest._made = None
-        return rest
+        if not special:
+            return [values[place] for place in self._places], []
+        found = [None if place in special else values[place] for place in self._places]
+        return found, [number for number, place in enumerate(self._places) if place in special]
 
     def _all(self) -> list[Sample]:
         if self._made is None:

@@ -157,6 +157,11 @@ class Tag:
         return is_json and names is None and clamp is None and self.origin.word is None
 
     @property
+    def is_scalar(self) -> bool:
+        """True if a good value is one number or bit."""
+        return self.element is None and not self.layout.type.is_text
+
+    @property
     def polled(self) -> bool:
         """False if it is written, never read."""
         return self.write is None or self.write.polled

@@ -16,7 +16,8 @@ import zenoh
 
 from gateway.contract import payload
 from gateway.contract.keys import Keys
-from gateway.northbound.publishing import publisher as publishing
+from gateway.northbound.answering.tag_index import TagIndex
+from gateway.northbound.publishing import handover
 from gateway.northbound.publishing.publisher import EVENTS_LIMIT, Publisher
 from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.tags import Reason, bad, good
@@ -34,6 +35,8 @@ from tests.northbound.plant import (
 )
 from tests.sim.plant import make_tag
 from tests.zenoh_peer import TIMEOUT, Received
+
+KEYS = Keys("plant", "demo")
 
 
 async def test_a_published_value_arrives_as_the_contract_says() -> None:
@@ -66,6 +69,10 @@ async def test_values_are_put_in_the_order_of_their_time_stamps() -> None:
         assert counters["superseded"] + len(received.samples) in range(600, 605)
 
 
+def a_publisher() -> Publisher:
+    return Publisher(KEYS, SlowPuts(1.0), TagIndex(KEYS, ()))
+
+
 class StuckSession:
     """The part of a session that the publisher uses; every put blocks until `go` is set."""
 
@@ -93,7 +100,7 @@ class StuckSession:
 async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order() -> None:
     plant = mixer()
     session: Any = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher = a_publisher()
     publisher.start(session)
     publisher.values([plant.now("mixer/speed", 0)])
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
@@ -112,8 +119,8 @@ async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order(
         (speed, 19_999),
     ]
     assert session.puts == sorted(session.puts)  # by their stamps
-    assert publisher.counters.superseded == 19_998
-    assert publisher.counters.published == 5
+    assert publisher.counts()["superseded"] == 19_998
+    assert publisher.counts()["published"] == 5
 
 
 class Block:
@@ -136,38 +143,38 @@ class Block:
 
 async def test_of_scans_that_wait_the_newest_value_of_each_tag_is_put_in_order() -> None:
     block, session = Block(), StuckSession()
-    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
-    publisher.scan(block.read(1, 1, 1))
+    publisher.values(block.read(1, 1, 1))
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)  # within that scan
-    publisher.scan(block.read(2, 2, 2))
-    publisher.scan(block.read(3, 2, 2))
+    publisher.values(block.read(2, 2, 2))
+    publisher.values(block.read(3, 2, 2))
     publisher.values([bad(block.tags[1], Reason.OVERDUE, 9)])
     for word in range(4, 1000):
-        publisher.scan(block.read(word, 2, 2))
+        publisher.values(block.read(word, 2, 2))
     session.go.set()
     await asyncio.to_thread(publisher.stop, TIMEOUT)
     assert [(key.rpartition("/")[2], value) for _, key, value in session.puts] == [
         ("t0", 1),
         ("t1", 1),
         ("t2", 1),
-        ("t1", 2),
         ("t2", 2),
         ("t1", None),
         ("t0", 999),
     ]
     assert session.puts == sorted(session.puts)  # by their stamps
-    assert publisher.counters.superseded == 997
-    assert publisher.counters.published == 7
+    assert publisher.counts()["superseded"] == 998
+    assert publisher.superseded["plant/mixer/t0"] == 997
+    assert publisher.counts()["published"] == 6
 
 
 async def test_an_alarm_goes_before_the_rest_of_a_scan() -> None:
-    block, session, keys = Block(), StuckSession(), Keys("plant", "demo")
-    publisher = Publisher(keys, SlowPuts(1.0))
+    block, session = Block(), StuckSession()
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
-    publisher.scan(block.read(1, 1, 1))
+    publisher.values(block.read(1, 1, 1))
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
-    publisher.document(keys.writes, b'{"value": 7}')
+    publisher.document(KEYS.writes, b'{"value": 7}')
     session.go.set()
     await asyncio.to_thread(publisher.stop, TIMEOUT)
     assert [value for *_, value in session.puts] == [1, 7, 1, 1]
@@ -180,82 +187,100 @@ async def test_an_alarm_goes_before_the_rest_of_a_scan() -> None:
 async def test_a_scan_has_the_documents_of_its_samples(shaping: Shaping) -> None:
     block, session = Block(shaping), StuckSession()
     session.go.set()
-    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
     samples = block.read(1, 12, 3)
-    publisher.scan(samples)
+    publisher.values(samples)
     await asyncio.to_thread(publisher.stop, TIMEOUT)
     assert session.documents == [payload.value(sample) for sample in samples]
 
 
 async def test_the_loop_waits_until_many_values_are_put(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishing, "_PAUSE", TIMEOUT)
+    monkeypatch.setattr(handover, "_PATIENCE", TIMEOUT)
     session = StuckSession()
     session.go.set()
-    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
-    publisher.values(good(make_tag(f"D{n}", type="uint16"), 1, 0) for n in range(200))
-    publisher.pause(200)
-    assert publisher.counters.published == 200
+    publisher.values([good(make_tag(f"D{n}", type="uint16"), 1, 0) for n in range(200)])
+    await asyncio.sleep(0)
+    assert publisher.counts()["published"] == 200
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+
+
+async def test_between_two_slices_of_the_thread_the_loop_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(handover, "_PATIENCE", TIMEOUT)
+    monkeypatch.setattr(handover, "SLICE", 20)
+    session = StuckSession()
+    session.go.set()
+    publisher = a_publisher()
+    publisher.start(session)  # type: ignore[arg-type]
+    publisher.values([good(make_tag(f"D{n}", type="uint16"), 1, 0) for n in range(500)])
+    turns = 0
+    while publisher.counts()["published"] < 500:
+        await asyncio.sleep(0)
+        turns += 1
+    assert turns > 10
     await asyncio.to_thread(publisher.stop, TIMEOUT)
 
 
 async def test_the_loop_waits_once_for_a_link_that_is_stuck(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(publishing, "_PAUSE", 0.2)
+    monkeypatch.setattr(handover, "_PATIENCE", 0.2)
     session = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
     many = [make_tag(f"D{n}", type="uint16") for n in range(200)]
     begun = time.monotonic()
     for count in range(1000):
-        publisher.values(good(tag, count, 0) for tag in many)
-        publisher.pause(200)
-    assert time.monotonic() - begun < 100.0  # each time it would be 200 s
+        publisher.values([good(tag, count, 0) for tag in many])
+        await asyncio.sleep(0)
+    assert time.monotonic() - begun < 100.0  # with a wait each time it would be 200 s
     session.go.set()
     await asyncio.to_thread(publisher.stop, TIMEOUT)
 
 
 async def test_outcomes_and_alarms_go_before_values_and_documents_that_wait() -> None:
     plant = mixer()
-    keys, session = Keys("plant", "demo"), StuckSession()
-    publisher = Publisher(keys, SlowPuts(1.0))
+    session = StuckSession()
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
     publisher.values([plant.now("mixer/speed", 0)])
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
     publisher.values([plant.now("mixer/recipe", 1)])
-    publisher.document(keys.status("zenoh"), b'{"value": 2}')
-    publisher.document(keys.writes, b'{"value": 3}')
-    publisher.document(keys.writes, b'{"value": 4}')
+    publisher.document(KEYS.status("zenoh"), b'{"value": 2}')
+    publisher.document(KEYS.writes, b'{"value": 3}')
+    publisher.document(KEYS.writes, b'{"value": 4}')
     for value in (5, 6):  # the latest of each key
-        publisher.latest(keys.status("alarms/mixer"), f'{{"value": {value}}}'.encode)
+        publisher.latest(KEYS.status("alarms/mixer"), f'{{"value": {value}}}'.encode)
     session.go.set()
     await asyncio.to_thread(publisher.stop, TIMEOUT)
     assert [value for *_, value in session.puts] == [0, 3, 4, 6, 1, 2]
     urgent, low = zenoh.Priority.INTERACTIVE_HIGH, zenoh.Priority.DATA_LOW
     assert session.priorities == [low, urgent, urgent, urgent, low, low]
-    assert publisher.counters.published == 6
+    assert publisher.counts()["published"] == 6
 
 
 async def test_outcomes_beyond_the_limit_are_dropped_and_counted() -> None:
-    keys, session = Keys("plant", "demo"), StuckSession()
-    publisher = Publisher(keys, SlowPuts(1.0))
+    session = StuckSession()
+    publisher = a_publisher()
     publisher.start(session)  # type: ignore[arg-type]
     publisher.values([mixer().now("mixer/recipe", 0)])
     await asyncio.to_thread(session.hangs.wait, TIMEOUT)
     for value in range(EVENTS_LIMIT + 5):
-        publisher.document(keys.writes, f'{{"value": {value}}}'.encode())
+        publisher.document(KEYS.writes, f'{{"value": {value}}}'.encode())
     session.go.set()
     await asyncio.to_thread(publisher.stop, TIMEOUT)
-    assert publisher.counters.dropped == 5
+    assert publisher.counts()["dropped"] == 5
     assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
 
 
 async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
     plant = mixer()
     session: Any = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"), SlowPuts(1.0))
+    publisher = a_publisher()
     publisher.events([plant.now("mixer/speed", 0)])  # no session yet
     publisher.start(session)
     publisher.values([plant.now("mixer/recipe", 0)])
@@ -263,7 +288,7 @@ async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
     publisher.events(plant.now("mixer/speed", value) for value in range(EVENTS_LIMIT + 5))
     session.go.set()
     await asyncio.to_thread(publisher.stop, TIMEOUT)
-    assert publisher.counters.dropped == 6
+    assert publisher.counts()["dropped"] == 6
     assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
 
 

@@ -3,9 +3,8 @@
 import pytest
 
 from gateway.northbound.publishing.slow_puts import ROUNDS, SlowPuts
-from tests.northbound.plant import tag
 
-SPEED, LEVEL = (tag("mixer", name) for name in ("speed", "level"))
+SPEED, LEVEL = "plant/mixer/speed", "plant/mixer/level"
 LIMIT = 0.05
 
 
@@ -50,9 +49,3 @@ def test_puts_long_after_the_last_slow_one_are_not_suspect(losses: SlowPuts) -> 
     losses.sent([LEVEL], LIMIT, 100.0)
     losses.sent([SPEED], 0.0, 100.0 + ROUNDS[-1] + 0.1)
     assert losses.due(101.0) == [LEVEL]
-
-
-def test_reloads_under_a_full_link_keep_no_tag_of_before(losses: SlowPuts) -> None:
-    for n in range(100):  # each reload makes another tag of the same name
-        losses.sent([tag("mixer", "speed")], LIMIT, 100.0 + n)
-    assert len(losses.due(300.0)) == 1

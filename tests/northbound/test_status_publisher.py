@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 
 from gateway.contract.keys import Keys
+from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.publishing.publisher import Publisher
 from gateway.northbound.publishing.slow_puts import SlowPuts
 from gateway.northbound.publishing.status_publisher import StatusPublisher
@@ -30,7 +31,7 @@ class Plant:
 
 
 def published(plant: Plant) -> StatusPublisher:
-    publisher = Publisher(KEYS, SlowPuts(0.05))
+    publisher = Publisher(KEYS, SlowPuts(0.05), TagIndex(KEYS, ()))
     return StatusPublisher(KEYS, plant.collect, publisher, Audit(lambda _: None), 5.0)
 
 

@@ -15,7 +15,6 @@ class _Entry(NamedTuple):
 
     device: Device
     area: zenoh.KeyExpr
-    tags: tuple[tuple[str, Tag], ...]  # with their value keys
 
 
 class TagIndex:
@@ -24,21 +23,17 @@ class TagIndex:
     def __init__(self, keys: Keys, devices: Iterable[Device]) -> None:
         self._keys = keys
         self._entries = [
-            _Entry(
-                device,
-                zenoh.KeyExpr(f"{keys.device(device.name)}/**"),
-                tuple((keys.value(tag.key), tag) for tag in device.tags),
-            )
-            for device in devices
+            _Entry(device, zenoh.KeyExpr(f"{keys.device(device.name)}/**")) for device in devices
         ]
-        self._by_key = {key: tag for entry in self._entries for key, tag in entry.tags}
-        self.tags: Sequence[Tag] = list(self._by_key.values())
+        self.tags: Sequence[Tag] = [tag for entry in self._entries for tag in entry.device.tags]
+        self.keys = {tag: keys.value(tag.key) for tag in self.tags}  # of their values
+        self._by_key = {key: tag for tag, key in self.keys.items()}
         modes = {entry.device.name: entry.device.blocks for entry in self._entries}
         self.names = frozenset(modes)
         self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
         self.only_blocks = frozenset(name for name, mode in modes.items() if mode == "only")
-        # True if each sample is one put, and a newer one may replace it.
-        self.only_values = not (self.with_blocks or any(tag.publishing.event for tag in self.tags))
+        with_events = frozenset(tag.device for tag in self.tags if tag.publishing.event)
+        self.sorted_out = self.with_blocks | with_events  # each value of the others is one put
 
     def become(self, other: "TagIndex") -> None:
         """Takes over the devices of another index. Each look-up sees the old or the new ones."""
@@ -68,9 +63,10 @@ class TagIndex:
         found: list[Tag] = []
         for entry in self._entries:
             if selector.includes(entry.area):
-                found.extend(tag for _, tag in entry.tags)
+                found.extend(entry.device.tags)
             elif selector.intersects(entry.area):
-                found.extend(tag for key, tag in entry.tags if selector.intersects(key))
+                keys = ((tag, self.keys[tag]) for tag in entry.device.tags)
+                found.extend(tag for tag, key in keys if selector.intersects(key))
         return found
 
     def devices_at(self, expression: str) -> list[Device]:

@@ -26,18 +26,13 @@ _JSON_FORM = Form.JSON  # looking up a member of an enumeration takes 0.2 µs
 def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
     if sample.tag.publishing.payload is _JSON_FORM:
-        put_value(session, key, payload.value(sample), stamp)
+        put_json(session, key, payload.value(sample), stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)
     if text is None:
         session.delete(key, timestamp=stamp, attachment=attachment, **_LOW)
         return
     session.put(key, text, encoding=_TEXT, timestamp=stamp, attachment=attachment, **_LOW)
-
-
-def put_value(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp | None) -> None:
-    """Raises `ZError`."""
-    session.put(key, data, encoding=_JSON, timestamp=stamp, **_LOW)
 
 
 def put_json(

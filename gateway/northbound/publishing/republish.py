@@ -98,11 +98,12 @@ class Republisher:
     async def _lost_values(self) -> None:
         while True:
             await asyncio.sleep(_LOSS_CHECK)
-            tags, congested = self._losses.due(_now()), self._losses.congested
-            for start in range(0, len(tags), _FEW):
+            keys, congested = self._losses.due(_now()), self._losses.congested
+            for start in range(0, len(keys), _FEW):
                 if self._losses.congested > congested:
                     break  # the link is full again: the rest waits for the next round
-                self._publish_again(tags[start : start + _FEW])
+                found = map(self._index.tag_at, keys[start : start + _FEW])
+                self._publish_again([tag for tag in found if tag is not None])
                 await asyncio.sleep(_FEW_EVERY)
 
     async def _lost_documents(self) -> None:

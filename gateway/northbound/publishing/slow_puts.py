@@ -9,8 +9,6 @@ again in rounds with growing pauses, and the next slow put starts the rounds aga
 import threading
 from collections.abc import Iterable
 
-from gateway.tags import Tag
-
 # Seconds from the last slow put to each round. A link that sends nothing for longer is closed as
 # a rule; then all values are published again when it returns.
 ROUNDS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -23,35 +21,34 @@ class SlowPuts:
     def __init__(self, limit: float) -> None:
         """`limit`: seconds that a put waits for room before Zenoh drops it."""
         self.congested = 0  # puts that took as long as `limit`, since the start
-        self._limit = limit
+        self.limit = limit
+        self.until = _NEVER  # what is put before is suspect
         self._slow_at = _NEVER
         self._round = 0
-        # By key, in the order of their last put: the tag that a reload put there takes the place
-        # of the one before.
-        self._suspects: dict[str, Tag] = {}
+        self._suspects: dict[str, None] = {}  # keys of values, in the order of their last put
         self._lock = threading.Lock()
 
-    def sent(self, tags: Iterable[Tag], took: float, now: float) -> None:
-        """Notes one put: the tags of its samples, and how many seconds it took."""
-        if took < self._limit and now > self._slow_at + ROUNDS[-1]:
+    def sent(self, keys: Iterable[str], took: float, now: float) -> None:
+        """Notes one put: the keys of its values, and how many seconds it took."""
+        if took < self.limit and now > self.until:
             return
         with self._lock:
-            if took >= self._limit:
+            if took >= self.limit:
                 self.congested += 1
-                self._slow_at = now
+                self._slow_at, self.until = now, now + ROUNDS[-1]
                 self._round = 0
-            for tag in tags:
-                self._suspects.pop(tag.key, None)
-                self._suspects[tag.key] = tag
+            for key in keys:
+                self._suspects.pop(key, None)
+                self._suspects[key] = None
 
-    def due(self, now: float) -> list[Tag]:
-        """Returns the tags to put again now; the longest waiting first."""
+    def due(self, now: float) -> list[str]:
+        """Returns the keys to put again now; the longest waiting first."""
         with self._lock:
             if not self._suspects or now < self._slow_at + ROUNDS[self._round]:
                 return []
-            tags = list(self._suspects.values())
+            keys = list(self._suspects)
             self._round += 1
             if self._round == len(ROUNDS):
                 self._suspects.clear()
                 self._round = 0
-            return tags
+            return keys

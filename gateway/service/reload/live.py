@@ -71,8 +71,7 @@ class LiveReload:
         # A device is claimed before its first request, and until after its last one.
         await northbound.claim(names.union(d.name for d in self._reloader.current.devices))
         await Renewal(self._plant, self._lines, difference).run()
-        gone = [tag for change in difference.devices.values() for tag in change.gone]
-        await northbound.change(index, [*gone, *difference.computed.gone])
+        await northbound.change(index)
         await northbound.claim(names)
         _collect()
 

@@ -1,0 +1,78 @@
+"""Loop and publishing thread take turns: both need the same lock of Python.
+
+With many values to send the loop gives the thread slices of time, and waits meanwhile. Otherwise
+the thread gets the lock only while the loop waits for a system call, and each of its puts may wait
+for the loop: it sends less the more there is to send. A thread that hangs in a put gets no slices:
+the loop does not wait for a link that is stuck.
+"""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+from math import inf
+
+SLICE = 500  # puts, which take about 2 ms; between two slices the loop turns once
+_MANY = 50  # waiting puts for which the loop waits
+_PATIENCE = 0.01  # seconds that the loop waits for a slice; one that takes longer hangs in a put:
+_CALM = 0.1  # the loop does not wait for so many seconds
+_ALONE = 0.05  # seconds without a slice after which the thread goes on by itself
+
+
+class Handover:
+    """The lock of the queue, and the slices of the thread."""
+
+    def __init__(self, waiting: Callable[[], int]) -> None:
+        """`waiting`: returns the number of waiting puts."""
+        self.lock = threading.Condition()
+        self.puts = 0  # since the start
+        self.until = inf  # the slice ends with so many puts
+        self._waiting = waiting
+        self._over = threading.Event()
+        self._calm = -inf  # the loop does not wait before, by the monotonic clock,
+        self._stuck_at = -1  # nor while there were so many puts
+        self._comes = False  # the next slice is scheduled
+
+    # -- event loop --
+
+    def soon(self) -> None:
+        """Wakes the thread at the end of this pass of the loop, for what was queued in it."""
+        if not self._comes:
+            self._comes = True
+            asyncio.get_running_loop().call_soon(self._slice)
+
+    def _slice(self) -> None:
+        self._comes = False
+        waits = self._waiting() >= _MANY and self.puts != self._stuck_at
+        waits = waits and time.monotonic() >= self._calm
+        with self.lock:
+            self._over.clear()
+            self.let_run()
+            if not waits:
+                return
+            self.until = self.puts + SLICE
+        if not self._over.wait(_PATIENCE):
+            self._calm, self._stuck_at = time.monotonic() + _CALM, self.puts
+            self.until = inf
+        elif self._waiting():
+            self.soon()
+
+    # -- any thread --
+
+    def let_run(self) -> None:
+        """Lets the thread go on without slices. The caller has the lock."""
+        self.until = inf
+        self.lock.notify()
+
+    # -- the thread --
+
+    def rest(self) -> None:
+        """Waits for something to send. The caller has the lock."""
+        self._over.set()
+        self.lock.wait()
+
+    def give_back(self) -> None:
+        """Ends a slice, and waits for the next one."""
+        with self.lock:
+            self._over.set()
+            self.lock.wait(_ALONE)
