@@ -2,8 +2,11 @@
 # The digest is that of python:3.12.14-slim-trixie for all machines; Dependabot proposes newer ones.
 ARG BASE=python:3.12-slim@sha256:78387bc3881b8273120a12ebe6c1ab22b018ccc2c9adf565ae1ac9b536e184ea
 FROM ${BASE} AS build
+# constraints-bridges.txt adds what `plc-gateway bridge mqtt` and `bridge opcua` need.
+ARG PINS=constraints.txt
 WORKDIR /src
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE ./
+COPY ${PINS} constraints.txt
 COPY gateway gateway
 COPY packaging/sbom.cdx.json packaging/sbom.cdx.json
 RUN python -m venv /opt/gateway \

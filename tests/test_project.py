@@ -65,7 +65,9 @@ def test_the_library_of_the_page_is_the_one_that_its_page_names() -> None:
 
 def test_the_container_is_built_with_every_file_that_the_build_needs() -> None:
     copied = re.findall(r"^COPY (?!--from)(.*)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
-    assert set(copied[0].split()) >= {"pyproject.toml", "README.md", "LICENSE", "constraints.txt"}
+    assert set(copied[0].split()) >= {"pyproject.toml", "README.md", "LICENSE"}
+    assert copied[1] == "${PINS} constraints.txt"
+    assert "\nARG PINS=constraints.txt\n" in (ROOT / "Dockerfile").read_text()
 
 
 def test_the_lowest_supported_python_is_the_one_that_pip_accepts() -> None:
@@ -99,6 +101,14 @@ def test_every_pinned_package_is_pinned_by_hashes_and_in_both_files_alike() -> N
     assert [name for name, line in of_all.items() if "--hash=sha256:" not in line] == []
     for file in ("Makefile", "Dockerfile", "docs/deployment.md"):
         assert "--require-hashes --requirement constraints.txt" in (ROOT / file).read_text()
+
+
+def test_the_container_with_bridges_has_the_packages_of_the_gateway_and_of_their_extras() -> None:
+    of_all, own, bridges = (pins(f"constraints{kind}.txt") for kind in ("-dev", "", "-bridges"))
+    assert own.items() <= bridges.items() <= of_all.items()
+    extras = PROJECT["project"]["optional-dependencies"]
+    assert {"asyncua", "aiomqtt", "protobuf"} <= bridges.keys() - own.keys()
+    assert len(extras["mqtt"] + extras["opcua"]) == 3  # `make pins` names these two
 
 
 def test_every_package_of_the_project_has_a_pin() -> None:

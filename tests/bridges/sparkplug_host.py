@@ -169,6 +169,18 @@ class SparkplugHost:
     def kinds(self) -> list[str]:
         return [message.kind for message in self.messages]
 
+    def alive(self) -> set[str]:
+        """Returns the devices that were born since the node was, and did not die."""
+        found = set[str]()
+        for message in self.messages:
+            if message.kind in ("NBIRTH", "NDEATH"):
+                found.clear()
+            elif message.kind == "DBIRTH":
+                found.add(message.device)
+            elif message.kind == "DDEATH":
+                found.discard(message.device)
+        return found
+
     def _subscribe(self) -> None:
         group, node = self._ids
         options = SubscribeOptions(qos=1, retainAsPublished=True)

@@ -94,7 +94,7 @@ _OWN = {"use", "repeat"}
 def expanded(file: YamlFile, mistakes: Mistakes, folder: FilePath) -> Mapping[str, Any]:
     """Returns the data without templates; that of a file without templates is not touched.
 
-    `use` of a device is the list of the templates that it had. `mistakes` gets the places of the expanded data.
+    `use` of a device is the list of its templates. `mistakes` gets the places of the new data.
     """
     data = file.data
     uses = any("use" in device for device in devices_in(data))
