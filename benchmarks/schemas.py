@@ -8,10 +8,13 @@ from typing import Any
 from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 
-from gateway.contract.documents.catalogue import FILE, KINDS, PLACE, RAW, REASONS, SUBSCRIBE
+from gateway.contract.documents.catalogue import FILE, PLACE, RAW, REASONS, SUBSCRIBE
+from gateway.contract.documents.catalogue import KINDS as CORE
 from gateway.contract.keys import CONTRACT
+from gateway.parts import registry
 
 ROOT = Path(__file__).parents[1]
+KINDS = (*CORE, *(one for _, part in registry.kinds() for one in part.documents))
 ASYNCAPI = ROOT / "docs" / "asyncapi.json"
 
 

@@ -55,12 +55,8 @@ def _of_parts(documents: Documents) -> Iterator[Fault]:
         if document["why"]:
             again = f"it is tried again in {document['again']} s"
             yield Fault("part-stopped", f"{part} stopped: {document['why']}; {again}")
-    for file in documents.get("damaged", {"files": ()})["files"]:
-        yield Fault(
-            "damaged-file",
-            f"{file} is a damaged file that was moved aside, and what it held is forgotten: remove "
-            "or rename it when you know",
-        )
+        for one in document.get("faults", ()):
+            yield Fault(**one)
     for door, document in below("doors/", documents):
         if document["trouble"]:
             which = f"door {door} to line {document['line']}"

@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gateway.config import Config
+from gateway.contract.documents.catalogue import DocumentKind
 from gateway.contract.interfaces import History, North
+from gateway.contract.line_faults import Fault
 from gateway.line.wire_log import WireLog
 from gateway.plant.plant import Plant
 from gateway.tags import Sample, Tag, WriteResult
@@ -139,6 +141,13 @@ class Documented(Protocol):
 
 
 @runtime_checkable
+class Faulty(Protocol):
+    """Says itself what needs a person: a fault in status, page, metrics and commands."""
+
+    def faults(self) -> Sequence[Fault]: ...
+
+
+@runtime_checkable
 class Republishes(Protocol):
     """Publishes what subscribers may have missed."""
 
@@ -243,3 +252,4 @@ class Kind:
     make: Callable[[Core], Part | None]  # None: the file does not want it
     phase: Phase = Phase.ACTIVE
     serves: type[Any] | None = None  # the capability that others ask for, although it is stopped
+    documents: Sequence[DocumentKind] = ()  # the types of its documents

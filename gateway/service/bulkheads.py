@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 import structlog
 
 from gateway.config import Config
-from gateway.contract.documents.state import PartDocument
+from gateway.contract.documents.state import FaultDocument, PartDocument
 from gateway.contract.interfaces import History, Keyed, North
+from gateway.contract.line_faults import Fault
 from gateway.errors import Busy, GatewayError
 from gateway.plant.part import (
     Activates,
@@ -21,6 +22,7 @@ from gateway.plant.part import (
     Begins,
     Core,
     Documented,
+    Faulty,
     Follows,
     Kind,
     LoadedFile,
@@ -179,11 +181,15 @@ class Bulkhead:
 
     def document(self) -> PartDocument:
         """`again`: seconds until a stopped part is tried again."""
-        again = None
+        again, faults = None, list[Fault]()
+        if isinstance(self.part, Faulty):
+            with self:
+                faults += self.part.faults()
         if self.why:
             now = asyncio.get_running_loop().time()
             again = max(0, round(self._again_at - now))
-        return {"why": self.why, "again": again, "failures": self.failures}
+        told: list[FaultDocument] = [{"code": one.code, "text": one.text} for one in faults]
+        return {"why": self.why, "again": again, "failures": self.failures, "faults": told}
 
 
 class Bulkheads:

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from gateway.config import Config, ConfigErrors, load
 from gateway.config import schema as made_schema
+from gateway.config.messages import one_of
 from gateway.config.settings import parsers
 from gateway.config.settings.session_model import Section, ZenohSection
 from gateway.config.tags.section import TagDefaults
@@ -27,6 +28,7 @@ from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
+from gateway.protocols.registry import PROTOCOLS
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Deadband, Form, Publish, Tag, WriteRule
 from gateway.transport.port import Rfc2217Address, SerialPath, SimulatorAddress, TcpAddress
@@ -450,8 +452,7 @@ DEVICES = [
     bad(
         "no protocol",
         on_mixer("station: 1"),
-        f"5: {M}.protocol: missing: a device needs its protocol: "
-        "vigor, computer-link, modbus-rtu, modbus-ascii, modbus-tcp, fx or frames",
+        f"5: {M}.protocol: missing: a device needs its protocol: {one_of(PROTOCOLS)}",
     ),
     bad(
         "unknown protocol",

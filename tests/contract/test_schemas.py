@@ -11,7 +11,7 @@ import pytest
 from benchmarks import contract_reader, schemas
 from gateway.config import load
 from gateway.contract.access import certificates
-from gateway.contract.documents.catalogue import FILE, KINDS, PAST, SEND
+from gateway.contract.documents.catalogue import FILE, PAST, SEND
 from gateway.contract.documents.introspection import introspection
 from gateway.contract.keys import CONTRACT, Keys
 from gateway.contract.meta import meta
@@ -145,7 +145,7 @@ async def test_every_document_of_a_plant_with_faults_fits(plant: Plant) -> None:
         plant.plc.tell("set 1 D 20 1500")  # 150.0, beyond its clamp
         alarm = "plant/@gateway/demo/alarms/mixer/level"
         await client.get_until(alarm, lambda one: one["state"] == "active")
-        answered = {kind.name for kind in KINDS if kind.verbs == (SEND,)} - {"file order"}
+        answered = {kind.name for kind in schemas.KINDS if kind.verbs == (SEND,)} - {"file order"}
         async with asyncio.timeout(TIMEOUT):
             while not answered <= reader.seen:  # a busy machine may refuse one
                 for (key, _), replies in zip(REQUESTS, await client.many(REQUESTS), strict=True):

@@ -27,7 +27,7 @@ from gateway.service import bulkheads, service
 
 POINTS = (
     *("restore", "begin", "run", "seen", "publish", "publish_all", "retag", "take_over"),
-    *("documents", "activate", "set_online", "order", "page", "shown"),
+    *("documents", "faults", "activate", "set_online", "order", "page", "shown"),
 )
 AWAITED = {"restore", "begin", "publish_all", "take_over", "order"}
 OF_FILES = {"open", "os.rename", "os.remove", "os.mkdir", "os.listdir", "sqlite3.connect"}

@@ -263,5 +263,5 @@ async def test_documents_of_a_part_are_in_the_status() -> None:
     await running.start()
     status: Any = running.plant.status()
     assert status["toy"]["calls"] > 0
-    assert status["parts/toy"] == {"why": "", "again": None, "failures": 0}
+    assert status["parts/toy"] == {"why": "", "again": None, "failures": 0, "faults": []}
     await running.stop()

@@ -150,7 +150,7 @@ POINTS = {
     "transfers": ("run", "publish", "documents", "take_over"),
     "alarms": ("run", "seen", "documents", "retag", "take_over"),
     "notify": ("run", "documents"),
-    "damaged_files": ("run", "documents"),
+    "damaged_files": ("run", "documents", "faults"),
     "web": ("run",),
 }
 QUIET = {"certificates", "remote"}  # the file of this plant does not want them

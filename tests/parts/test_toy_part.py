@@ -1,4 +1,4 @@
-"""A part with settings, document, route and command is a folder, and a line of the list."""
+"""A part with settings, document, fault, route and command is a folder, and a line of the list."""
 
 import json
 import subprocess
@@ -24,17 +24,20 @@ def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
-def test_a_toy_part_has_settings_document_route_and_command(tmp_path: Path) -> None:
+def test_a_toy_part_has_settings_document_fault_route_and_command(tmp_path: Path) -> None:
     endpoint, port = free_endpoint(), free_port()
     web = {"listen": f"127.0.0.1:{port}"}
     file = write_config(tmp_path / "c.yaml", endpoint, LINES, web=web, toy={"greeting": "moin"})
     assert run("greet", file).stdout == "moin\n"
     with Program(sys.executable, "-c", PROGRAM, "run", file) as program:
         program.says("Zenoh session ready")
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/toy") as answer:
-            assert json.load(answer) == {"greeting": "moin"}
         status = run("health", file)
         assert status.returncode == 0, status.stderr
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/toy") as answer:
+            assert json.load(answer) == {"greeting": "moin"}
+        assert "the toy was greeted" in run("status", file).stdout
+        documents = json.loads(run("status", file, "--json").stdout)
+        assert documents["toy"] == {"greeting": "moin"}
 
 
 def test_a_mistake_in_its_section_has_its_line(tmp_path: Path) -> None:

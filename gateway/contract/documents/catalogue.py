@@ -1,4 +1,4 @@
-"""Every kind of document: its keys, what a client does there, and its type.
+"""Every kind of document: its keys, what a client does there, and its type; those of parts: `Kind`.
 
 `FILE` has the same as JSON Schema, for consumers. `make schema` writes it with
 `benchmarks/schemas.py`.
@@ -17,7 +17,7 @@ _SEEN = (SUBSCRIBE, GET)
 RAW, PLACE = "raw value: attachment", "block: attachment"
 
 
-class Kind(NamedTuple):
+class DocumentKind(NamedTuple):
     """One kind of document. `key`: below the prefix; `takes`: the payload that a client sends."""
 
     name: str
@@ -27,8 +27,17 @@ class Kind(NamedTuple):
     takes: Any = None
 
 
+def own(path: str) -> str:
+    """Returns the key of a gateway's own document."""
+    return f"@gateway/{{gateway}}/{path}"
+
+
+def in_status(path: str, shape: Any) -> DocumentKind:
+    """Returns the kind of the status documents of a path, such as `doors/{door}`."""
+    return DocumentKind(path.partition("/{")[0], own(path), _SEEN, shape)
+
+
 _TAG = "{device}/{tag}"
-_OWN = "@gateway/{gateway}"
 # Of values that are not good: the status codes of OPC UA, and the status signals of NAMUR NE 107.
 REASONS = {
     Reason.STARTING: ("BadWaitingForInitialData", "C"),
@@ -51,14 +60,9 @@ _STATE: dict[str, Any] = {  # by path
     "outcomes": state.OutcomesDocument,
     "alarms": state.AlarmCounts,
     "files/{file}": state.FileDocument,
-    "damaged": state.DamagedDocument,
-    "transfers/{number}": state.TransferDocument,
-    "doors/{door}": state.DoorDocument,
-    "notify/{way}": state.NotifyDocument,
     "clock": state.ClockDocument,
     "parts/{part}": state.PartDocument,
     "certificates/{setting}": state.CertificateDocument,
-    "history": state.HistoryDocument,
     "reload": state.ReloadDocument,
     "report": fleet.ReportDocument,
     "remote/{file}": fleet.RemoteDocument,
@@ -66,38 +70,45 @@ _STATE: dict[str, Any] = {  # by path
     "claim/{session}": state.ClaimDocument,
 }
 KINDS = (
-    Kind("value", _TAG, _SEEN, values.ValueDocument),
-    Kind(RAW, _TAG, _SEEN, values.WithoutValue),
-    Kind("past values", _TAG, (PAST,), values.ValueDocument),
-    Kind("past values: bucket", _TAG, (PAST,), values.BucketDocument),
-    Kind("page", f"{_OWN}/page", (GET,), values.PageDocument),
-    Kind("block", "{device}/@block", _SEEN, values.BlockDocument),
-    Kind(PLACE, "{device}/@block", (SUBSCRIBE,), values.PlaceDocument),
-    Kind("meta", f"{_TAG}/@meta", (GET,), values.MetaDocument),
-    Kind("write", f"{_TAG}/@set", (SEND,), requests.WrittenDocument, requests.WriteRequest),
-    Kind("group", "{device}/@set", (SEND,), requests.GroupDocument, requests.GroupRequest),
-    Kind("command", "{device}/@{command}", (SEND,), requests.CommandDocument),
-    Kind("command to a line", f"{_OWN}/lines/{{line}}/global", (SEND,), requests.CommandDocument),
-    Kind("peek", "{device}/@peek", (SEND,), requests.PeekDocument),
-    Kind("error", "{any}", (GET, PAST, SEND), requests.FailureDocument | requests.GroupDocument),
-    Kind("outcome", f"{_OWN}/writes", (SUBSCRIBE, PAST), requests.OutcomeDocument),
-    Kind("outcome: suppressed", f"{_OWN}/writes", (SUBSCRIBE, PAST), requests.SuppressedDocument),
-    Kind("alarm", f"{_OWN}/alarms/{{alarm}}", _SEEN, requests.AlarmDocument),
-    Kind("past alarm", f"{_OWN}/alarms/{{alarm}}", (PAST,), requests.AlarmEvent),
-    Kind(
+    DocumentKind("value", _TAG, _SEEN, values.ValueDocument),
+    DocumentKind(RAW, _TAG, _SEEN, values.WithoutValue),
+    DocumentKind("past values", _TAG, (PAST,), values.ValueDocument),
+    DocumentKind("past values: bucket", _TAG, (PAST,), values.BucketDocument),
+    DocumentKind("page", own("page"), (GET,), values.PageDocument),
+    DocumentKind("block", "{device}/@block", _SEEN, values.BlockDocument),
+    DocumentKind(PLACE, "{device}/@block", (SUBSCRIBE,), values.PlaceDocument),
+    DocumentKind("meta", f"{_TAG}/@meta", (GET,), values.MetaDocument),
+    DocumentKind("write", f"{_TAG}/@set", (SEND,), requests.WrittenDocument, requests.WriteRequest),
+    DocumentKind("group", "{device}/@set", (SEND,), requests.GroupDocument, requests.GroupRequest),
+    DocumentKind("command", "{device}/@{command}", (SEND,), requests.CommandDocument),
+    DocumentKind(
+        "command to a line", own("lines/{line}/global"), (SEND,), requests.CommandDocument
+    ),
+    DocumentKind("peek", "{device}/@peek", (SEND,), requests.PeekDocument),
+    DocumentKind(
+        "error", "{any}", (GET, PAST, SEND), requests.FailureDocument | requests.GroupDocument
+    ),
+    DocumentKind("outcome", own("writes"), (SUBSCRIBE, PAST), requests.OutcomeDocument),
+    DocumentKind(
+        "outcome: suppressed", own("writes"), (SUBSCRIBE, PAST), requests.SuppressedDocument
+    ),
+    DocumentKind("alarm", own("alarms/{alarm}"), _SEEN, requests.AlarmDocument),
+    DocumentKind("past alarm", own("alarms/{alarm}"), (PAST,), requests.AlarmEvent),
+    DocumentKind(
         "acknowledgement",
-        f"{_OWN}/alarms/{{alarm}}",
+        own("alarms/{alarm}"),
         (SEND,),
         requests.AlarmDocument,
         requests.AcknowledgeRequest,
     ),
-    Kind("release", f"{_OWN}/doors/{{door}}", (SEND,), state.DoorDocument, requests.DoorRequest),
-    Kind("file order", f"{_OWN}/remote/file", (SEND,), fleet.RemoteDocument, fleet.RemoteOrder),
-    Kind("audit", f"{_OWN}/audit/{{number}}", (PAST,), requests.AuditRecord),
-    Kind("trace", f"{_OWN}/lines/{{line}}/@trace", (SUBSCRIBE,), requests.TraceDocument),
-    Kind("description", f"{_OWN}/@describe", (GET,), dict[str, Any]),
-    Kind("introspection", f"{_OWN}/@introspect", (GET,), state.IntrospectDocument),
-    *(Kind(path.partition("/{")[0], f"{_OWN}/{path}", _SEEN, of) for path, of in _STATE.items()),
+    DocumentKind(
+        "file order", own("remote/file"), (SEND,), fleet.RemoteDocument, fleet.RemoteOrder
+    ),
+    DocumentKind("audit", own("audit/{number}"), (PAST,), requests.AuditRecord),
+    DocumentKind("trace", own("lines/{line}/@trace"), (SUBSCRIBE,), requests.TraceDocument),
+    DocumentKind("description", own("@describe"), (GET,), dict[str, Any]),
+    DocumentKind("introspection", own("@introspect"), (GET,), state.IntrospectDocument),
+    *(in_status(path, of) for path, of in _STATE.items()),
 )
 
 

@@ -1,12 +1,25 @@
 """The keys that one gateway serves, what a client may do there, and its devices."""
 
+import json
 from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Any
 
 from gateway import __version__
-from gateway.contract.documents.catalogue import KINDS, PAST
+from gateway.contract.documents.catalogue import PAST, described
 from gateway.contract.documents.state import IntrospectDocument
 from gateway.contract.interfaces import Device
 from gateway.contract.keys import CONTRACT, Keys
+
+
+@cache
+def _documents() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(described())["documents"]
+    return found
+
+
+def _of(keys: Keys, key: str) -> str:
+    return key.replace("{prefix}", keys.prefix).replace("{gateway}", keys.gateway)
 
 
 def introspection(
@@ -25,12 +38,12 @@ def introspection(
         "signed": signed,
         "history": history,
         "documents": {
-            kind.name: {
-                "key": f"{keys.prefix}/{kind.key}".replace("{gateway}", keys.gateway),
-                "verbs": [verb for verb in kind.verbs if history or verb != PAST],
+            name: {
+                "key": _of(keys, kind["key"]),
+                "verbs": [verb for verb in kind["verbs"] if history or verb != PAST],
             }
-            for kind in KINDS
-            if history or kind.verbs != (PAST,)
+            for name, kind in _documents().items()
+            if history or kind["verbs"] != [PAST]
         },
         "devices": {
             device.name: {

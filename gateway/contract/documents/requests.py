@@ -209,9 +209,3 @@ class AcknowledgeRequest(TypedDict):
     do: NotRequired[Literal["acknowledge", "shelve", "unshelve", "out-of-service", "in-service"]]
     reason: NotRequired[str]
     seconds: NotRequired[float]
-
-
-class DoorRequest(TypedDict):
-    """The order to disconnect the programs of a door."""
-
-    do: Literal["release"]

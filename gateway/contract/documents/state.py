@@ -8,7 +8,6 @@ from gateway.contract.documents.values import Number, Time, words
 from gateway.engine.device.identity import Verdict
 from gateway.engine.device.records import CallState
 from gateway.tags.tag import NotReal
-from gateway.values import Value
 
 Standing = Annotated[str, words("starting", "up", "failing", "silent")]
 
@@ -175,24 +174,26 @@ class AlarmCounts(TypedDict):
     flood_since: NotRequired[Time | None]
 
 
+class FaultDocument(TypedDict):
+    """What needs a person. Programs count by `code`."""
+
+    code: str
+    text: str
+
+
 class PartDocument(TypedDict):
-    """Why a part stopped; `why` is empty while it works."""
+    """Why a part stopped; `why` is empty while it works. `faults`: those that it says itself."""
 
     why: str
     again: int | None
     failures: int
+    faults: list[FaultDocument]
 
 
 class FileDocument(TypedDict):
     """Why the last change of a file is not on disk; empty: it is."""
 
     trouble: str
-
-
-class DamagedDocument(TypedDict):
-    """Damaged files that were moved aside."""
-
-    files: list[str]
 
 
 class CertificateDocument(TypedDict):
@@ -227,29 +228,6 @@ class ReloadDocument(TypedDict):
     why: list[str]
 
 
-class HistoryDocument(TypedDict):
-    """The history file. `state` is `ok` or one sentence. `room`: bytes that it may still grow;
-    `free`: bytes on its disk."""
-
-    state: str
-    aside: list[str]
-    recorded: int
-    stored: int
-    waiting: int
-    lag: float
-    lost: int
-    writes_stored: int
-    writes_lost: int
-    refusals_stored: int
-    refusals_lost: int
-    alarms_stored: int
-    alarms_lost: int
-    bytes: int
-    room: NotRequired[int]
-    free: NotRequired[int | None]
-    oldest: Time | None
-
-
 class StandbyDocument(TypedDict):
     """The gateway in its standby group."""
 
@@ -268,86 +246,6 @@ class ClaimDocument(TypedDict):
     devices: list[str]
     origins: NotRequired[dict[str, NotReal]]
     signature: NotRequired[str]
-
-
-_Ends = TypedDict("_Ends", {"from": str, "to": str})
-
-
-class TransferDocument(_Ends):
-    """One row of the transfers."""
-
-    when: str
-    state: Literal["starting", "carried", "stale", "waiting", "refused", "unclear"]
-    code: Literal["0", "2", "4", "5", "6", "A", "B"] | None
-    meaning: str
-    why: str
-    value: Value | None
-    time: Time | None
-    last_carried: float | None
-    age: float | None
-    carried: int
-    not_done: int
-    refused: int
-    unclear: int
-
-
-class GuestDocument(TypedDict):
-    """A program that is connected to a door; `since`: seconds ago."""
-
-    address: str
-    since: float
-    requests: int
-    writes: int
-    refused: int
-    unanswered: int
-
-
-class RepeatedRead(TypedDict):
-    """Addresses that programs at a door read again and again.
-
-    `type`: of all of them, as a tag has it; `every`: seconds between two reads; `tags`: those of
-    the device that have some of these addresses.
-    """
-
-    device: str
-    address: str
-    type: str
-    count: int
-    every: float
-    tags: list[str]
-
-
-class DoorDocument(TypedDict):
-    """A door of a line for other programs.
-
-    `share`: of the wire time of the last minute, by all doors of the line.
-    """
-
-    line: str
-    listen: str
-    protocol: str
-    trouble: str
-    most: float
-    share: float
-    turned_away: int
-    programs: list[GuestDocument]
-    reads: list[RepeatedRead]
-
-
-class NotifyDocument(TypedDict):
-    """One way on which alarms reach people.
-
-    `oldest`: the time of the message that waits longest. `failed`: tries in a row. `dropped`:
-    messages that were too old, or too many.
-    """
-
-    waiting: int
-    oldest: str | None
-    sent: int
-    last_sent: str | None
-    failed: int
-    dropped: int
-    trouble: str
 
 
 class ServedKey(TypedDict):

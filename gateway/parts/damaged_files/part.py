@@ -8,13 +8,23 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from typing_extensions import TypedDict
+
 from gateway.config import Config
 from gateway.config.loading import written
+from gateway.contract.documents.catalogue import in_status
+from gateway.contract.line_faults import Fault
 from gateway.plant.part import Core, Kind, Phase
 from gateway.plant.saved_file import ASIDE
 from gateway.plant.threads import off_loop
 
 LOOK_EVERY = 2.0  # seconds
+
+
+class DamagedDocument(TypedDict):
+    """Damaged files that were moved aside."""
+
+    files: list[str]
 
 
 class DamagedFilesPart:
@@ -33,6 +43,13 @@ class DamagedFilesPart:
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         return {"damaged": {"files": self._found}}
 
+    def faults(self) -> Sequence[Fault]:
+        told = "is a damaged file that was moved aside, and what it held is forgotten"
+        return [
+            Fault("damaged-file", f"{file} {told}: remove or rename it when you know")
+            for file in self._found
+        ]
+
 
 def moved_aside(config: Config) -> list[str]:
     """Returns the paths of the files that were moved aside. Blocks."""
@@ -40,4 +57,4 @@ def moved_aside(config: Config) -> list[str]:
     return [str(file) for file in files if file.is_file()]
 
 
-KIND = Kind(DamagedFilesPart, Phase.SHOWING)
+KIND = Kind(DamagedFilesPart, Phase.SHOWING, documents=(in_status("damaged", DamagedDocument),))

@@ -5,9 +5,9 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
 from gateway.line.line import Line
+from gateway.parts.doors.documents import GuestDocument
 from gateway.parts.doors.guest_requests import NOT_NOW, Outcome, Unanswered
 from gateway.parts.doors.stores import Needs, Outcomes, Step
 from gateway.stations.served.answering import Heard

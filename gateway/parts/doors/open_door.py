@@ -10,11 +10,11 @@ import structlog
 from gateway.config import Config
 from gateway.contract import payload
 from gateway.contract.documents.requests import OutcomeDocument
-from gateway.contract.documents.state import DoorDocument
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import LineDown
 from gateway.line.line import Line
 from gateway.line.opening import Pauses
+from gateway.parts.doors.documents import DoorDocument
 from gateway.parts.doors.guest import Guest
 from gateway.parts.doors.guest_requests import GuestRequests
 from gateway.parts.doors.repeated_reads import RepeatedReads

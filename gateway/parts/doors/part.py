@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from gateway.config import Config
 from gateway.contract import payload
-from gateway.contract.documents.state import DoorDocument
+from gateway.contract.documents.catalogue import SEND, DocumentKind, in_status, own
 from gateway.contract.interfaces import Keyed
 from gateway.errors import BadValue, NoHistory, Unknown
+from gateway.parts.doors.documents import DoorDocument, DoorRequest
 from gateway.parts.doors.guest_requests import GuestRequests
 from gateway.parts.doors.open_door import OpenDoor
 from gateway.parts.doors.settings import Sharing
@@ -75,4 +76,8 @@ def _make(core: Core) -> Part | None:
     return None if sharing is None else SharingPart(core, sharing)
 
 
-KIND = Kind(_make, Phase.DRIVING, serves=Keyed)
+DOCUMENTS = (
+    in_status("doors/{door}", DoorDocument),
+    DocumentKind("release", own("doors/{door}"), (SEND,), DoorDocument, DoorRequest),
+)
+KIND = Kind(_make, Phase.DRIVING, serves=Keyed, documents=DOCUMENTS)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from gateway.config.transfers.ranges import UNIT_KINDS
-from gateway.contract.documents.state import RepeatedRead
 from gateway.engine.device.device_settings import DeviceSettings
+from gateway.parts.doors.documents import RepeatedRead
 from gateway.protocols.driver import Address, Span
 
 MOST_KEPT = 200  # spans of a door: those that were read last

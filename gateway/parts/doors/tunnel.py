@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from gateway.contract.documents.state import GuestDocument
 from gateway.errors import LineDown
 from gateway.line.line import Line
 from gateway.parts.doors.com_port import DRAINS, Change, ComPort, Item, Plain, Reply, Speech
+from gateway.parts.doors.documents import GuestDocument
 from gateway.parts.doors.guest import MOST_WAITING, guest_document
 from gateway.parts.doors.settings import RFC2217
 from gateway.transport import Port

@@ -7,9 +7,11 @@ from heapq import merge
 from itertools import islice
 from os.path import realpath
 from pathlib import Path
-from typing import TypeVar
+from typing import NotRequired, TypeVar
 
-from gateway.contract.documents.state import HistoryDocument
+from typing_extensions import TypedDict
+
+from gateway.contract.documents.values import Time
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.history_query import HistoryQuery
 from gateway.contract.past.timerange import TimeRange, time_range
@@ -29,6 +31,29 @@ T = TypeVar("T")
 LONGEST_RUN = 32_768  # samples
 OLDEST_RUN = 600.0  # seconds
 HIGHEST_LIMIT = 1_000_000_000  # samples
+
+
+class HistoryDocument(TypedDict):
+    """The history file. `state` is `ok` or one sentence. `room`: bytes that it may still grow;
+    `free`: bytes on its disk."""
+
+    state: str
+    aside: list[str]
+    recorded: int
+    stored: int
+    waiting: int
+    lag: float
+    lost: int
+    writes_stored: int
+    writes_lost: int
+    refusals_stored: int
+    refusals_lost: int
+    alarms_stored: int
+    alarms_lost: int
+    bytes: int
+    room: NotRequired[int]
+    free: NotRequired[int | None]
+    oldest: Time | None
 
 
 class Historian:

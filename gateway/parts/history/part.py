@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 
 import structlog
 
+from gateway.contract.documents.catalogue import in_status
 from gateway.contract.interfaces import History
-from gateway.parts.history.historian import Historian
+from gateway.parts.history.historian import Historian, HistoryDocument
 from gateway.parts.history.settings import HistorySection
 from gateway.plant.part import Core, Kind, Part, Phase, Remembers
 from gateway.plant.plant import Plant
@@ -56,4 +57,6 @@ def _make(core: Core) -> Part | None:
     return HistoryPart(core.plant, Historian(kept.path, kept.keep, kept.max_size))
 
 
-KIND = Kind(_make, Phase.KEEPING, serves=Remembers)
+KIND = Kind(
+    _make, Phase.KEEPING, serves=Remembers, documents=(in_status("history", HistoryDocument),)
+)

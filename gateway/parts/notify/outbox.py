@@ -4,11 +4,28 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from gateway.contract.documents.state import NotifyDocument
+from typing_extensions import TypedDict
+
 from gateway.parts.notify.message import Message
 from gateway.tags.timestamps import rfc3339
 
 MOST = 1000  # messages of one way; then the oldest is dropped
+
+
+class NotifyDocument(TypedDict):
+    """One way on which alarms reach people.
+
+    `oldest`: the time of the message that waits longest. `failed`: tries in a row. `dropped`:
+    messages that were too old, or too many.
+    """
+
+    waiting: int
+    oldest: str | None
+    sent: int
+    last_sent: str | None
+    failed: int
+    dropped: int
+    trouble: str
 
 
 class Outbox:

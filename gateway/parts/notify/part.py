@@ -12,8 +12,9 @@ from typing import Any
 import orjson
 import structlog
 
+from gateway.contract.documents.catalogue import in_status
 from gateway.parts.notify.message import Message, message
-from gateway.parts.notify.outbox import Outbox
+from gateway.parts.notify.outbox import NotifyDocument, Outbox
 from gateway.parts.notify.settings import NotifySection, rules_of
 from gateway.parts.notify.watch import Alarm, Told, Watch
 from gateway.parts.notify.ways import ways, why_not_sent
@@ -166,4 +167,4 @@ def _make(core: Core) -> Part | None:
     return None if settings is None else NotifyPart(core, settings)
 
 
-KIND = Kind(_make)
+KIND = Kind(_make, documents=(in_status("notify/{way}", NotifyDocument),))

@@ -4,7 +4,9 @@ import asyncio
 from collections.abc import Mapping, Sequence
 
 from gateway.config import Config
+from gateway.contract.documents.catalogue import in_status
 from gateway.engine.forecast import LineForecast
+from gateway.parts.transfers.documents import TransferDocument
 from gateway.parts.transfers.forecast import transfer_forecasts, with_transfers
 from gateway.parts.transfers.runner import Transfers
 from gateway.plant.part import Core, Kind, Phase
@@ -39,4 +41,6 @@ def with_writes(config: Config, polls: Sequence[LineForecast]) -> Sequence[LineF
     return with_transfers(lines, transfer_forecasts(config, lines))
 
 
-KIND = Kind(TransferPart, Phase.DRIVING)
+KIND = Kind(
+    TransferPart, Phase.DRIVING, documents=(in_status("transfers/{number}", TransferDocument),)
+)

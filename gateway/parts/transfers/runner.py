@@ -9,9 +9,9 @@ from functools import partial
 
 import structlog
 
-from gateway.contract.documents.state import TransferDocument
 from gateway.errors import GatewayError
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
+from gateway.parts.transfers.documents import TransferDocument
 from gateway.parts.transfers.transfer_row import Carry, SourceReading, State, TransferRow
 from gateway.plant.doors import Condition, Reading
 from gateway.plant.plant import Plant
