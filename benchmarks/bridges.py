@@ -2,10 +2,12 @@
 
     python -m benchmarks.bridges [--tags 20000] [--rates 2000 5000 10000 20000] [--seconds 10]
 
-A played gateway publishes changes of all tags in turn, one message each. The other end is mosquitto
-with mosquitto_sub, or a server that takes lines. A bridge keeps the last value of a tag that waits:
-so it leaves out changes before it leaves the present behind. `late`: from the last change until the
-other end has all present values. Needs mosquitto and its clients.
+A played gateway publishes changes of all tags in turn, one message each. As a gateway does, it puts
+values again that a full link may have dropped; `--once`: it does not. `--hold 2`: the bridge stands
+still for so many seconds at the end of each rate, so that its link is full. The other end is
+mosquitto with mosquitto_sub, or a server that takes lines. A bridge keeps the last value of a tag
+that waits: so it leaves out changes before it leaves the present behind. `late`: from the last
+change until the other end has all present values. Needs mosquitto and its clients.
 """
 
 import argparse
@@ -16,11 +18,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, redirect_stdout
+from contextlib import ExitStack, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from gateway.bridges.mqtt.sparkplug.messages import Payload
+from gateway.northbound.publishing.slow_puts import SlowPuts
+from tests.bridges.campaign import stopped
 from tests.bridges.campaign_clients import InfluxServer
 from tests.bridges.played import PlayedGateway
 from tests.conftest import needs
@@ -32,19 +36,22 @@ DOORS = ("mqtt", "sparkplug", "influx")
 
 
 class Figures(NamedTuple):
-    """Changes a second sent and arrived, share of one processor, seconds, tags."""
+    """Changes a second sent and arrived, share of one processor, seconds, tags; puts of this door
+    until then that found a full link."""
 
     sent: float
     arrived: float
     cpu: float
     late: float
     missing: int
+    slow: int
 
 
 class Plant:
     """A played gateway with many tags. `values`: what it published last."""
 
-    def __init__(self, endpoint: str, tags: int) -> None:
+    def __init__(self, endpoint: str, tags: int, *, once: bool) -> None:
+        self.losses = SlowPuts(float("inf") if once else 0.05)
         names = [f"d{n // PER_DEVICE}/t{n % PER_DEVICE}" for n in range(tags)]
         about: dict[str, dict[str, Any]] = {name: {"type": "int32"} for name in names}
         self.gateway = PlayedGateway(endpoint, about)
@@ -56,7 +63,20 @@ class Plant:
             name = self._names[self._next % len(self._names)]
             self._next += 1
             self.values[name] = self._next
-            self.gateway.put(name, self._next)
+            self._put(name)
+
+    def _put(self, name: str) -> None:
+        began = time.monotonic()
+        self.gateway.put(name, self.values[name])
+        now = time.monotonic()
+        self.losses.sent([name], now - began, now)
+
+    def again(self) -> None:
+        """Puts values again when it is time for it, until the link is full again."""
+        names, congested = self.losses.due(time.monotonic()), self.losses.congested
+        for name in names:
+            if self.losses.congested == congested:
+                self._put(name)
 
     def publish_for(self, seconds: float, rate: int) -> float:
         """Returns the rate that was reached."""
@@ -65,6 +85,7 @@ class Plant:
             due = int(passed * rate) - sent
             self.publish(min(due, 500))
             sent += min(due, 500)
+            self.again()
             time.sleep(0.005)
         return sent / (time.monotonic() - began)
 
@@ -123,12 +144,20 @@ class Reader:
         self._take([(self._keys[one.alias], one.int_value) for one in found])
 
 
-def measure(door: str, tags: int, rates: Sequence[int], seconds: float) -> list[Figures]:
+def measure(
+    door: str,
+    tags: int,
+    rates: Sequence[int],
+    seconds: float,
+    *,
+    once: bool = False,
+    hold: float = 0.0,
+) -> list[Figures]:
     endpoint, port = free_endpoint(), free_port()
     found = []
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        plant = Plant(endpoint, tags)
+        plant = Plant(endpoint, tags, once=once)
         stack.enter_context(plant.gateway)
         stack.enter_context(Program(needs("mosquitto"), "-p", port))
         until(lambda: listens(port), "the broker listens")
@@ -152,14 +181,18 @@ def measure(door: str, tags: int, rates: Sequence[int], seconds: float) -> list[
             before, used = reader.count, processor(bridge.pid)
             began = time.monotonic()
             sent = plant.publish_for(seconds, rate)
+            with stopped(bridge) if hold else nullcontext():
+                plant.publish_for(hold, rate)
             ended, used = time.monotonic(), processor(bridge.pid) - used
             reader.look()
             arrived = (reader.count - before) / (ended - began)
             while not present() and time.monotonic() < ended + 60:
+                plant.again()
                 time.sleep(0.05)
             missing = sum(value != reader.values.get(key) for key, value in plant.values.items())
             late = time.monotonic() - ended
-            found.append(Figures(sent, arrived, used / (ended - began), late, missing))
+            slow = plant.losses.congested
+            found.append(Figures(sent, arrived, used / (ended - began), late, missing, slow))
     return found
 
 
@@ -175,18 +208,21 @@ def main() -> None:
     parser.add_argument("--rates", type=int, nargs="+", default=[2000, 5000, 10_000, 20_000])
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--doors", nargs="+", default=DOORS)
+    parser.add_argument("--once", action="store_true")
+    parser.add_argument("--hold", type=float, default=0.0)
     given = parser.parse_args()
     load, cores = os.getloadavg()[0], os.cpu_count()
     print(f"{given.tags:,} tags; {cores} processors, load {load:.1f} before")
-    print("| bridge | changes/s sent | arrived | CPU of the bridge | late | tags missing |")
-    print("|---|---|---|---|---|---|")
+    print("| bridge | changes/s sent | arrived | CPU of the bridge | late | missing | slow puts |")
+    print("|---|---|---|---|---|---|---|")
     for door in given.doors:
         with redirect_stdout(io.StringIO()):  # what the programs said
-            found = measure(door, given.tags, given.rates, given.seconds)
+            how = {"once": given.once, "hold": given.hold}
+            found = measure(door, given.tags, given.rates, given.seconds, **how)
         for one in found:
             print(
                 f"| {door} | {one.sent:,.0f} | {one.arrived:,.0f} | {one.cpu:.0%} |"
-                f" {one.late:.1f} s | {one.missing} |",
+                f" {one.late:.1f} s | {one.missing} | {one.slow} |",
                 flush=True,
             )
 
