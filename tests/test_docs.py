@@ -487,6 +487,7 @@ def test_the_reference_lists_every_command_and_every_option() -> None:
     single = {name: one for name, one in group.commands.items() if not hasattr(one, "commands")}
     for name, group_of in group.commands.items() - single.items():
         single |= {f"{name} {sub}": command for sub, command in group_of.commands.items()}
+        single |= {name: group_of} if group_of.invoke_without_command else {}
     options = {
         (name, option)
         for name, command in single.items()

@@ -25,7 +25,11 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "simulate": ("plant.yaml --tcp 127.0.0.1:5020", "plant.yaml --links /tmp/plant"),
     "status": ("plant.yaml --watch", "plant.yaml --json"),
     "health": ("plant.yaml", "plant.yaml --strict"),
-    "fleet": ("works --connect tcp/router:7447", "works --folder files --remember seen.json"),
+    "fleet": (
+        "works --folder files --remember seen.json",
+        "works render station.yaml stations.csv files",
+        "works apply files --canary 3 --wait 10min --connect tcp/router:7447",
+    ),
     "remote": ("plant.yaml new.yaml", "plant.yaml new.yaml --yes --within 5min"),
     "ca create": ("pki",),
     "ca issue": ("pki hall gateway.plant 10.0.0.5", "pki scada --client"),

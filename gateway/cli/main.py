@@ -38,7 +38,7 @@ _COMMANDS = {
     "simulate": "line.simulate:simulate",
     "status": "status:status",
     "health": "status:health",
-    "fleet": "fleet.command:fleet",
+    "fleet": "fleet.command:cli",
     "remote": "fleet.remote:remote",
     "ca": "certificates.command:cli",
     "enrol": "certificates.command:enrol",

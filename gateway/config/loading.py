@@ -33,18 +33,22 @@ def load(
     report: Callable[[str, float], None] | None = None,
     imports: Mapping[str, tuple[Path, Grid]] | None = None,
     text: str | None = None,
+    *,
+    elsewhere: bool = False,
 ) -> Config:
     """Reads and checks the file. Paths in it are relative to its folder; those of files that the
     gateway writes are relative to `state_folder()`, if there is one.
 
     `report` receives the name of each step and the share of it that is done. `imports`: a sheet
     with more tags, by device. `text`: what the file is going to have.
+    `elsewhere`: it is for another machine; secrets and certificates that it names are there.
     Raises `ConfigErrors` with every mistake.
     """
     read = None if report is None else partial(report, f"reading {Path(path).name}")
     checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
         file, mistakes = read_yaml(Path(path), TEXTS, read, text)
+        mistakes.elsewhere = elsewhere
         builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
         data = expanded(file, mistakes, Path(path).parent)
         config = builder.config(data)

@@ -66,9 +66,11 @@ class Mistake(NamedTuple):
 
 @dataclass(slots=True)
 class Mistakes:
-    """The mistakes found so far in one file."""
+    """The mistakes found so far in one file. `elsewhere`: it is the file of another machine, which
+    has the files that it names."""
 
     places: Places
+    elsewhere: bool = False
     _found: list[Mistake] = field(default_factory=list)
     _others: list["Mistakes"] = field(default_factory=list)
 

@@ -135,10 +135,9 @@ class Keys:
     def statuses(self) -> str:
         return f"{self.own}/**"
 
-    @property
-    def reports(self) -> str:
-        """The reports of all gateways under the prefix, and under prefixes below it."""
-        return f"{self.prefix}/**/@gateway/*/report"
+    def everywhere(self, path: str) -> str:
+        """A document of all gateways under the prefix, and under prefixes below it."""
+        return f"{self.prefix}/**/@gateway/*/{path}"
 
     @property
     def describe(self) -> str:

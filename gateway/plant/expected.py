@@ -3,13 +3,33 @@
 from collections.abc import Callable, Sequence
 
 from gateway.config import Config
-from gateway.engine.forecast import LineForecast
+from gateway.engine.device.device import Device
+from gateway.engine.forecast import LineForecast, forecast
 
 Adjust = Callable[[Config, Sequence[LineForecast]], Sequence[LineForecast]]
 
 
 def _as_they_are(_: Config, lines: Sequence[LineForecast]) -> Sequence[LineForecast]:
     return lines
+
+
+def polls_of(
+    config: Config, report: Callable[[str, float], None] | None = None
+) -> list[LineForecast]:
+    """Calculates the load and the worst ages of each polled line of a file, without its transfers.
+    Takes seconds for a large file.
+
+    `report` receives the name of this step and the share of it that is done.
+    """
+    found = []
+    for line in config.lines:
+        if line.serve:
+            continue
+        devices = [Device(device, line.wire) for device in line.devices if device.enabled]
+        found.append(forecast(line.name, devices, line.wire))
+        if report is not None:
+            report("planning the requests", len(found) / len(config.lines))
+    return found
 
 
 class Expected:
@@ -35,6 +55,10 @@ class Expected:
     def drop(self, line: str) -> None:
         self._polls.pop(line, None)
         self._found = (None, {})
+
+    def of(self, config: Config) -> Sequence[LineForecast]:
+        """Returns the forecasts of another file, adjusted. A thread may do it: it takes long."""
+        return self._adjust(config, polls_of(config))
 
     def lines(self) -> dict[str, LineForecast]:
         """Returns the forecasts by line, adjusted once for each change."""

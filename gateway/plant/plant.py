@@ -198,6 +198,10 @@ class Plant:
     def unsubscribe(self, subscriber: Subscriber) -> None:
         self._subscribers.remove(subscriber)
 
+    def forecasts(self, config: Config) -> Sequence[LineForecast]:
+        """Returns the forecasts of the lines of another file. A thread may do it."""
+        return self._expected.of(config)
+
     def adjust_forecasts(self, adjust: Adjust) -> None:
         """Has the forecasts adjusted for the requests of a part."""
         self._expected.adjust(adjust)

@@ -9,12 +9,14 @@ from typing import Any, TypeVar
 import orjson
 import pytest
 
-from gateway.config import ConfigErrors, load
+from gateway.config import Config, ConfigErrors, load
 from gateway.config.changes import needs_restart
+from gateway.engine.forecast import LineForecast
 from gateway.errors import BadValue, Busy, GatewayError, NotAllowed, Unknown
 from gateway.parts.remote import part as module
 from gateway.parts.remote.part import RemotePart
 from gateway.parts.remote.settings import RemoteSection
+from gateway.plant.expected import polls_of
 
 T = TypeVar("T")
 Virtual = Callable[[Coroutine[Any, Any, Any]], Any]
@@ -60,6 +62,9 @@ class Gateway:
 
     def audit(self, _at: int, event: str) -> None:
         self.audited.append(json.loads(event)["answer"])
+
+    def forecasts(self, config: Config) -> Sequence[LineForecast]:
+        return polls_of(config)
 
     async def reload(self) -> Sequence[str]:
         if self.refuses:
@@ -211,6 +216,7 @@ def test_a_file_that_the_reload_refuses_goes_back_at_once(
     run_virtual(whole())
 
 
+HEAVY = file("D1", **{"lines:": "defaults: {every: 1ms}\nlines:"})
 WRONG: list[tuple[dict[str, Any], type[GatewayError], str]] = [
     ({"do": "apply", "file": "lines: ["}, BadValue, r"plant\.yaml:2: no YAML"),
     ({"do": "apply", "file": file("Q1")}, BadValue, "Q1"),
@@ -218,6 +224,8 @@ WRONG: list[tuple[dict[str, Any], type[GatewayError], str]] = [
     ({"do": "apply", "file": file("D1", **{"7447": "7448"})}, BadValue, "zenoh.listen changed"),
     ({"do": "apply", "file": file("D1", **{"[ana]": "[bob]"})}, BadValue, "remote.writers changed"),
     ({"do": "apply", "file": file("D1", **{"name: demo": "name: b"})}, BadValue, "gateway.name"),
+    ({"do": "apply", "file": HEAVY}, BadValue, "line hall is asked for .* multiply the intervals"),
+    ({"do": "check", "file": HEAVY}, BadValue, "line hall is asked for"),
     ({"do": "apply", "file": 7}, BadValue, "needs a text in `file`"),
     ({"do": "apply"}, BadValue, "needs a text in `file`"),
     ({"do": "apply", "file": file("D1"), "confirm": 1}, BadValue, "no number from 10 to 86400"),
@@ -251,6 +259,23 @@ def test_what_is_refused_changes_nothing(run_virtual: Virtual, tmp_path: Path) -
         assert (await ask(part, "check", file=file("D1")))["state"] == "none"
         assert gateway.path.read_text() == file("D0")
         assert gateway.loaded == [gateway.current.digest]
+
+    run_virtual(whole())
+
+
+def test_a_line_that_is_overloaded_already_may_become_lighter(
+    run_virtual: Virtual, tmp_path: Path
+) -> None:
+    async def whole() -> None:
+        gateway = Gateway(tmp_path)
+        gateway.path.write_text(HEAVY)
+        gateway.current = load(gateway.path)
+        part = await gateway.part()
+        lighter = HEAVY.replace("1ms", "2ms")
+        await ask(part, "apply", file=lighter)
+        await ask(part, "revert")
+        with pytest.raises(BadValue, match="is asked for"):
+            await ask(part, "apply", file=HEAVY.replace("D1", "D1}, more: {address: D900"))
 
     run_virtual(whole())
 

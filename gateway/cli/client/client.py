@@ -16,13 +16,14 @@ from gateway.cli.client.arguments import matches, tags_by_key
 from gateway.cli.client.rows import TagRow, document, raw, reason, without_gateway
 from gateway.cli.client.tracing import traced
 from gateway.cli.client.value_pages import paged
+from gateway.config import ZenohConfig
+from gateway.config.gateway_address import GatewayAddress
 from gateway.contract.keys import Keys
 from gateway.errors import GatewayError
 from gateway.values import Value
 
 if TYPE_CHECKING:
     from gateway.config import Config
-    from gateway.config.gateway_address import GatewayAddress
 
 REPLY_TIMEOUT = 10.0  # seconds
 _CHANGED = "does the gateway run with the current version of this file?"
@@ -107,11 +108,17 @@ class Client:
             raise GatewayError(self.no_reply)
         return found
 
-    def reports(self) -> Iterator[tuple[str, bytes, float]]:
-        """Yields key, payload and arrival (s since 1970) of the report of each gateway under the
+    def of(self, gateway: str) -> "Client":
+        """Returns a client of another gateway, by prefix and name, with the same session."""
+        prefix, _, name = gateway.rpartition("/")
+        place = GatewayAddress(name=name, standby=None, zenoh=ZenohConfig(prefix=prefix))
+        return Client(self._session, place, self._tell, self._user)
+
+    def everywhere(self, path: str) -> Iterator[tuple[str, bytes, float]]:
+        """Yields key, payload and arrival (s since 1970) of a document of each gateway under the
         prefix. One that hangs delays the end by `REPLY_TIMEOUT`, and nothing else."""
         for reply in self._session.get(
-            self._keys.reports,
+            self._keys.everywhere(path),
             timeout=REPLY_TIMEOUT,
             consolidation=zenoh.ConsolidationMode.NONE,
         ):

@@ -1,4 +1,4 @@
-"""The `fleet` command: asks every gateway under a prefix for its report, in one query."""
+"""The `fleet` commands: asks every gateway under a prefix for its report, in one query."""
 
 import csv
 import json
@@ -7,30 +7,46 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 from rich.text import Text
+from typer.core import TyperGroup
 
-from gateway.cli.client import connected
-from gateway.cli.fleet.rows import Row, State, Told, rows, told_by, wanted_in
-from gateway.cli.terminal import FAILED, ROUTER, AsJson, ZenohFile, err, out, printable
-from gateway.config import ZenohConfig, ZenohMode
-from gateway.config.gateway_address import GatewayAddress
+from gateway.cli.examples import epilog
+from gateway.cli.fleet.apply import apply
+from gateway.cli.fleet.place import Connect, Place
+from gateway.cli.fleet.render import render
+from gateway.cli.fleet.rows import Row, State, Told, rows, told_by
+from gateway.cli.terminal import FAILED, AsJson, ZenohFile, err, out, printable
 from gateway.contract.line_faults import span
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import GatewayError
 from gateway.plant.saved_file import SavedFile
 
 _STYLES = {State.MISSING: "red", State.FAULT: "red", State.LOOK: "yellow", State.GOOD: "green"}
 
 
+class _AfterPrefix(TyperGroup):
+    """A command may follow the prefix. Options of `fleet` stand anywhere before it."""
+
+    allow_interspersed_args = True
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        at = next((at for at, one in enumerate(args) if at and one in self.commands), len(args))
+        return super().parse_args(ctx, [*args[:at], "--", *args[at:]] if args else args)
+
+
+cli = typer.Typer(cls=_AfterPrefix, invoke_without_command=True, epilog=epilog("fleet"))
+cli.command()(apply)
+cli.command()(render)
+
+
+@cli.callback()
 def fleet(
+    ctx: typer.Context,
     prefix: Annotated[str, typer.Argument(metavar="PREFIX", help="of the keys, such as `works`.")],
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ENDPOINT", help=f"A router or a gateway; {ROUTER}."),
-    ] = None,
+    connect: Connect = None,
     zenoh_file: ZenohFile = None,
     folder: Annotated[
         Path | None,
@@ -44,20 +60,15 @@ def fleet(
     as_csv: Annotated[bool, typer.Option("--csv", help="One row for each gateway.")] = False,
 ) -> None:
     """Print all gateways under a prefix, the worst first."""
-    endpoints = tuple(connect or (() if zenoh_file else (ROUTER,)))
-    own = ZenohConfig(
-        prefix=prefix, mode=ZenohMode.CLIENT, connect=endpoints, config_file=zenoh_file
-    )
-    if folder is not None and not folder.is_dir():
-        raise ConfigError(f"{folder} is no folder")
-    with connected(GatewayAddress(name="fleet", standby=None, zenoh=own), err.print) as client:
+    place = ctx.obj = Place(prefix, connect, zenoh_file)
+    if ctx.invoked_subcommand is not None:
+        return
+    wanted, wrong = (None, []) if folder is None else place.wanted(folder)
+    with place.connected() as client:
         asked = time.time()
-        told, mistakes = told_by(client.reports(), asked)
-    wanted, wrong = (None, []) if folder is None else wanted_in(folder)
-    if wanted is not None:
-        wanted = {name: one for name, one in wanted.items() if _is_below(name, prefix)}
+        told, mistakes = told_by(client.everywhere("report"), asked)
     seen = {} if remember is None else _remembered(remember, told)
-    found = rows(told, wanted, {name: at for name, at in seen.items() if _is_below(name, prefix)})
+    found = rows(told, wanted, {name: at for name, at in seen.items() if place.has(name)})
     if as_json:
         for row in found:
             print(json.dumps(row.document()))
@@ -71,10 +82,6 @@ def fleet(
     bad = (State.MISSING, State.FAULT)
     if mistakes or wrong or not found or any(row.state in bad for row in found):
         sys.exit(FAILED)
-
-
-def _is_below(gateway: str, prefix: str) -> bool:
-    return f"{gateway}/".startswith(f"{prefix}/")
 
 
 def _remembered(path: Path, told: Mapping[str, Told]) -> dict[str, str]:

@@ -76,7 +76,7 @@ def wanted_in(folder: Path) -> tuple[dict[str, Wanted], list[str]]:
     files = sorted(file for tail in ("*.yaml", "*.yml") for file in folder.rglob(tail))
     for file in files[:MOST_FILES]:
         try:
-            config = load(file)
+            config = load(file, elsewhere=True)
         except ConfigErrors as error:
             mistakes.append(str(error).splitlines()[0])
             continue
@@ -160,8 +160,7 @@ def told_by(
     and what is wrong with them. `asked`: when the query began."""
     found, mistakes = dict[str, Told](), list[str]()
     for key, payload, arrived in replies:
-        prefix, _, rest = key.partition("/@gateway/")
-        gateway = f"{prefix}/{rest.removesuffix('/report')}"
+        gateway = gateway_of(key, "report")
         try:
             report = _REPORT.validate_json(payload)
             at = datetime.fromisoformat(report["time"]).timestamp()
@@ -173,3 +172,8 @@ def told_by(
             mistakes.append(f"two gateways are called {gateway}: give each its own `gateway.name`")
         found[gateway] = Told(report, max(0.0, at - arrived) + min(0.0, at - asked))
     return found, mistakes
+
+
+def gateway_of(key: str, path: str) -> str:
+    """Returns prefix and name of a gateway from the key of one of its documents."""
+    return key.replace("/@gateway/", "/").removesuffix(f"/{path}")

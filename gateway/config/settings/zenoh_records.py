@@ -78,10 +78,10 @@ def tls_files(found: TlsConfig, folder: FilePath, path: Path, mistakes: Mistakes
 def existing_file(
     name: FilePath | None, folder: FilePath, path: Path, mistakes: Mistakes
 ) -> FilePath | None:
-    """Returns the path of a file that must exist."""
+    """Returns the path of a file that must exist, if this is its machine."""
     if name is None:
         return None
     file = folder / name
-    if not is_file(file):
+    if not (mistakes.elsewhere or is_file(file)):
         mistakes.add(path, f"there is no file {file}")
     return file

@@ -127,12 +127,22 @@ class RemotePart:
                 await self._note(replace(self._change, state="confirmed", why=f"by {by}"))
 
     async def _checked(self, text: str) -> Config:
-        """Raises `BadValue` with the mistakes, and for what only a restart takes over."""
+        """Raises `BadValue` with the mistakes, for what only a restart takes over, and for a line
+        that would carry more than it can."""
         found = await off_loop(self._folder.checked, text, within=DISK_WITHIN)
         if changed := needs_restart(self._file.current, found):
             text = "this needs a restart, and a person beside the gateway"
             raise BadValue(f"{', '.join(changed)} changed: {text}")
+        if heavier := await off_loop(self._overloads, found, within=DISK_WITHIN):
+            raise BadValue("; ".join(heavier))
         return found
+
+    def _overloads(self, found: Config) -> list[str]:
+        """Returns a sentence for each line that is overloaded, and more than it is now."""
+        lines = [line for line in self._core.plant.forecasts(found) if line.overloaded]
+        now = self._core.plant.forecasts(self._file.current) if lines else ()
+        loads = {line.name: line.load for line in now}
+        return [line.advice() for line in lines if line.load > loads.get(line.name, 0.0)]
 
     async def _text_of(self, digest: str) -> str:
         for kept in reversed(await off_loop(self._folder.earlier, within=DISK_WITHIN)):

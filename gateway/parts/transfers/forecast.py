@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from gateway.config import Config
 from gateway.engine.device.device import Device
-from gateway.engine.forecast import LineForecast, TimedWrites, forecast, write_seconds
+from gateway.engine.forecast import LineForecast, TimedWrites, write_seconds
+from gateway.plant.expected import polls_of
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule, leaves
 
@@ -32,14 +33,7 @@ def forecasts(
 
     `report` receives the name of this step and the share of it that is done.
     """
-    found = []
-    for line in config.lines:
-        if line.serve:
-            continue
-        devices = [Device(device, line.wire) for device in line.devices if device.enabled]
-        found.append(forecast(line.name, devices, line.wire))
-        if report is not None:
-            report("planning the requests", len(found) / len(config.lines))
+    found = polls_of(config, report)
     return with_transfers(found, transfer_forecasts(config, found))
 
 
