@@ -2,7 +2,8 @@
 
 Gateways with simulated PLCs run: one that is well, one with a fault, one with many, one with 5,000
 tags. Chromium looks at each view of their pages, on a phone, a laptop and a wall display, in light
-and dark. All pictures are in `build/pictures`; `--docs` copies those of the pages to `docs/`.
+and dark, in English or with `--language` in another. All pictures are in `build/pictures`; `--docs`
+copies those of the pages to `docs/`.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from typing import Any
 import yaml
 
 from benchmarks.start import Sizes, rows
+from gateway.contract.languages import LANGUAGES, Language
 from tests.cli.bench_page import BenchPage, benched, shown
 from tests.e2e.processes import ROOT, free_port, plc_gateway, started
 from tests.web.browser import Tab, browser
@@ -41,6 +43,7 @@ DOCS = {
     "page.png": "fault-overview-laptop-light.png",
     "page-phone.png": "many-overview-phone-dark.png",
     "page-trend.png": "well-trend-laptop-dark.png",
+    "page-zh-tw.png": "fault-overview-laptop-light-zh-TW.png",
 }
 HALL_1 = """
 mixer:
@@ -142,7 +145,7 @@ class Peer(asyncio.Protocol):
             self._transport.write(bytes(byte ^ self._mask for byte in data))
 
 
-def files(folder: Path, ports: Ports) -> Iterator[tuple[str, Path, int]]:
+def files(folder: Path, ports: Ports, language: Language) -> Iterator[tuple[str, Path, int]]:
     """Writes the file of each situation; yields its name, its file, and the port of its page."""
     (folder / "tokens.txt").write_text(f"alice:{TOKEN}\n")
     (folder / "tokens.txt").chmod(0o600)
@@ -151,7 +154,11 @@ def files(folder: Path, ports: Ports) -> Iterator[tuple[str, Path, int]]:
         config = {
             "gateway": {"name": "hall"},
             "zenoh": {"listen": [free_endpoint()]},
-            "web": {"listen": f"127.0.0.1:{port}", "tokens_file": "tokens.txt"},
+            "web": {
+                "listen": f"127.0.0.1:{port}",
+                "tokens_file": "tokens.txt",
+                "language": language,
+            },
             "history": {"path": f"{name}.db"},
             "alarms": {"path": f"{name}.json", "devices": True},
             "defaults": {"every": "500ms", "history": True},
@@ -166,6 +173,7 @@ def files(folder: Path, ports: Ports) -> Iterator[tuple[str, Path, int]]:
 
 
 async def taken(tab: Tab, name: str, port: int, arguments: argparse.Namespace) -> None:
+    end = "" if arguments.language == "en" else f"-{arguments.language}"
     for view, address in VIEWS.items():
         if name == "large" and view in ("trend", "search"):
             address = {"trend": "trend?span=300&tags=d0-0/t0", "search": "tags?find=t42"}[view]
@@ -178,7 +186,7 @@ async def taken(tab: Tab, name: str, port: int, arguments: argparse.Namespace) -
                 await tab.until(READY.get(view, READY["overview"]))
                 wide = await tab.value("document.documentElement.scrollWidth")
                 assert wide <= width, f"{name} {view} is {wide} wide on a {size}"
-                await tab.screenshot(arguments.into / f"{name}-{view}-{size}-{scheme}.png")
+                await tab.screenshot(arguments.into / f"{name}-{view}-{size}-{scheme}{end}.png")
 
 
 LIVE = 'document.body?.className === ""'
@@ -189,9 +197,9 @@ READY = {
     '.every((one) => (one.getAttribute("d").match(/H/g) ?? []).length > 2)',
     "tags": f'{LIVE} && document.querySelectorAll("#space .value").length',
     "lines": f'{LIVE} && document.querySelectorAll("#lines-list li").length',
-    "alarms": f'{LIVE} && document.getElementById("alarms-head").textContent.startsWith("Alarms:")',
+    "alarms": f'{LIVE} && document.querySelectorAll("#alarms-list li").length',
     "trend": 'document.querySelector("#chart canvas") && '
-    'document.getElementById("trend-text").textContent.includes(" to ")',
+    '/\\d:\\d/.test(document.getElementById("trend-text").textContent)',
 }
 READY["search"] = READY["tags"]
 
@@ -226,12 +234,14 @@ async def look_at_bench(arguments: argparse.Namespace) -> None:
 
 async def run(arguments: argparse.Namespace) -> None:
     arguments.into.mkdir(parents=True, exist_ok=True)
-    await look_at_bench(arguments)
+    if arguments.language == "en":
+        await look_at_bench(arguments)
     ports = Ports()
     async with AsyncExitStack() as stack:
         await ports.serve(stack)
         with tempfile.TemporaryDirectory() as folder, ExitStack() as programs:
-            situations = [one for one in files(Path(folder), ports) if one[0] in arguments.plants]
+            situations = list(files(Path(folder), ports, arguments.language))
+            situations = [one for one in situations if one[0] in arguments.plants]
             for _, path, _ in situations:
                 programs.enter_context(started(path))
             await asyncio.sleep(arguments.after)
@@ -255,12 +265,14 @@ def main() -> None:
     parser.add_argument("--plants", nargs="+", choices=PLANTS, default=PLANTS)
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--schemes", nargs="+", choices=SCHEMES, default=SCHEMES)
+    parser.add_argument("--language", choices=LANGUAGES, default="en")
     arguments = parser.parse_args()
     os.nice(5)
     asyncio.run(run(arguments))
     if arguments.docs:
         for name, picture in DOCS.items():
-            shutil.copy(arguments.into / picture, ROOT / "docs" / name)
+            if (arguments.into / picture).exists():
+                shutil.copy(arguments.into / picture, ROOT / "docs" / name)
 
 
 if __name__ == "__main__":

@@ -77,8 +77,8 @@ def certificate_fault(setting: str, document: Document) -> str:
     if document["trouble"]:
         return f"{setting} {file}: {document['trouble']}"
     if days < 0:
-        what = "Zenoh accepts" if setting.startswith("zenoh") else "the other side accepts"
-        return f"{setting} {file} expired {-days:.0f} days ago: {what} no new connection"
+        who = "Zenoh" if setting.startswith("zenoh") else "the other side"
+        return f"{setting} {file} expired {-days:.0f} days ago: {who} accepts no new connection"
     if days < DAYS_LEFT:
         return f"{setting} {file} expires in {days:.0f} days: renew it"
     return ""
@@ -125,8 +125,8 @@ def warnings(documents: Documents) -> Iterator[str]:
 
 def _of_remote(change: Document) -> Iterator[str]:
     if change["state"] == "waiting":
-        back = f"it goes back at {change['until']}"
-        yield f"the file of {change['by']} waits for confirmation: {back}"
+        by, until = change["by"], change["until"]
+        yield f"the file of {by} waits for confirmation: it goes back at {until}"
     elif change["state"] == "failed":
         yield f"the file of {change['by']} did not go back: {change['why']}"
 

@@ -58,6 +58,15 @@ class Tab:
         )
         return answer["result"].get("value")
 
+    async def leave(self, expression: str) -> None:
+        """Evaluates what loads the page again, and waits until it is loaded."""
+        message = {"id": next(self._numbers), "method": "Runtime.evaluate"}
+        await self._socket.send_json({**message, "params": {"expression": expression}})
+        async with asyncio.timeout(PATIENCE):
+            while message.get("method") != "Page.loadEventFired":
+                message = json.loads((await self._socket.receive()).data)
+                self._note(message)
+
     async def until(self, expression: str) -> None:
         """Waits until the expression is true, checked at each change of the page."""
         try:

@@ -301,10 +301,15 @@ CUT = """
 """
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (1920, 1080)])
-async def test_nothing_is_cut_off(tab: Tab, tokens: Path, width: int, height: int) -> None:
+@pytest.mark.parametrize(
+    ("width", "height", "language"),
+    [(390, 844, "de"), (1920, 1080, "en")],  # German has the longest words
+)
+async def test_nothing_is_cut_off(
+    tab: Tab, tokens: Path, width: int, height: int, language: str
+) -> None:
     plant = oven()
-    async with serving(plant=plant, tokens_file=tokens) as client:
+    async with serving(plant=plant, tokens_file=tokens, language=language) as client:
         await tab.look(width, height, dark=width < 600)
         for view in ("overview", "tags", "alarms", "lines", "trend?tags=oven/temperature"):
             await opened(tab, client, view)

@@ -19,12 +19,13 @@ from gateway.config.sheets.grid import MOST_BYTES
 from gateway.errors import ConfigError, GatewayError
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.guard import Guard
+from gateway.parts.web.languages import catalogue_route
 from gateway.parts.web.listener import Listener, files_of
 from gateway.parts.web.server import ASSETS
 from gateway.parts.web.settings import WebSection
 
 _FOLDER = Path(__file__).parent / "assets"
-_SHARED = {"/page.css", "/dom.js", "/icon.svg"}  # with the page of the gateway
+_SHARED = {"/page.css", "/dom.js", "/language.js", "/icon.svg"}  # with the page of the gateway
 _HOST = "127.0.0.1"
 _ADDRESS = "Bench: http://127.0.0.1:{}/#{} (works once; Ctrl-C ends the bench)"
 
@@ -67,7 +68,12 @@ async def serve(api: BenchApi, at: int, tell: Callable[[str], None]) -> None:
     entry, connections = Entry(lambda key: tell(_ADDRESS.format(port.result(), key))), Connections()
     config = WebSection().model_copy(update={"listen": (_HOST, at)})
     shared = [one for one in files_of(ASSETS, "page.html") if one.path in _SHARED]
-    routes = [*api.routes(entry), *files_of(_FOLDER, "bench.html"), *shared]
+    routes = [
+        *api.routes(entry),
+        *files_of(_FOLDER, "bench.html"),
+        *shared,
+        catalogue_route("bench"),
+    ]
     listener = Listener(
         config, Guard(config, connections, entry), connections, routes, most_body=MOST_BYTES
     )

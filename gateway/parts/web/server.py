@@ -18,6 +18,7 @@ from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events
 from gateway.parts.web.guard import Guard
+from gateway.parts.web.languages import catalogue_route
 from gateway.parts.web.line_past import Loads
 from gateway.parts.web.listener import Listener, file_route, files_of
 from gateway.parts.web.routes import Route
@@ -53,6 +54,7 @@ class Server:
             *events.routes(),
             *self._probes(),
             *files_of(ASSETS, "page.html"),
+            catalogue_route("page", config.language),
         ]
         self.description = openapi.document(routes)
         text = json.dumps(self.description, indent=2).encode()

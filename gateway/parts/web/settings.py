@@ -7,6 +7,7 @@ from typing import Any
 from gateway.config.settings.sections import PartSection, Place
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import FilePath, HostName, Text, WebAddress, WebOrigin
+from gateway.contract.languages import Language
 from gateway.transport.port import is_loopback, named
 
 
@@ -31,6 +32,8 @@ class WebSection(Section):
     overview: list[Text] = []
     """Tags that the page shows first, in this order: keys, also with *; left out: those with an
     alarm, a history or a unit."""
+    language: Language | None = None
+    """The language of the page, unless a person chooses another; left out: that of the browser."""
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
     origins: list[WebOrigin] = []

@@ -1,6 +1,7 @@
 // The bench: scan, look, name, import, see the change, apply it, keep it.
 
 import { byId, h, keyed, put, style } from "./dom.js";
+import { listed, said, t } from "./language.js";
 import { call, enter, lost, step } from "./call.js";
 import { showDevices, startRegisters } from "./registers.js";
 import { showSheetDevices, startSheet } from "./sheet.js";
@@ -50,7 +51,7 @@ for (const name of ["undo", "reread", "apply", "keep", "back"]) {
 async function look() {
   state = await call("state");
   lost("");
-  document.title = `Bench: ${state.file}`;
+  document.title = t("Bench: {file}", state);
   put("file", state.file.split("/").at(-1));
   byId("file").title = state.file;
   showGateway(state.gateway);
@@ -60,7 +61,7 @@ async function look() {
 }
 
 function showGateway({ state: runs, log }) {
-  put("gateway", runs ? (runs === "own" ? "gateway runs" : "a gateway runs already") : "no gateway runs");
+  put("gateway", runs ? (runs === "own" ? t("gateway runs") : t("a gateway runs already")) : t("no gateway runs"));
   style(byId("gateway"), `pill ${runs ? "good" : "starting"}`);
   put("log", log.join("\n"));
   byId("values-card").hidden = !runs;
@@ -77,27 +78,27 @@ function showScan({ scan: found, ports, protocols, draft }) {
   options(byId("protocol"), protocols);
   byId("scanning").hidden = !found.runs;
   byId("share").value = found.share;
-  put("what", found.runs ? `asking ${found.what}` : "");
+  put("what", found.runs ? t("asking {what}", found) : "");
   put("scan-said", [found.error, ...found.noises].filter(Boolean).join("\n"));
   const key = found.runs || !found.found.length ? "" : `${found.port} ${found.found.map((one) => one.station)}`;
   if (key === named) return;
   named = key;
   byId("stations-form").hidden = !key;
-  put("found-title", `Found at ${found.at}, ${found.port}:`);
+  put("found-title", t("Found at {at}, {port}:", found));
   byId("gateway-label").hidden = draft.exists || draft.devices.length > 0;
   keyed(byId("found"), found.found, (one) => one.station, station, () => {});
 }
 
 function station(one) {
   const row = h("li", {});
-  row.use = h("input", { type: "checkbox", checked: true, "aria-label": `use station ${one.station}` });
-  row.name = h("input", { value: `station-${one.station}`, autocomplete: "off", "aria-label": `name of station ${one.station}` });
-  row.append(h("label", {}, row.use, ` station ${one.station}`), row.name, one.refusal ? h("span", { className: "soft" }, `error reply: ${one.refusal}`) : "");
+  row.use = h("input", { type: "checkbox", checked: true, "aria-label": t("use station {station}", one) });
+  row.name = h("input", { value: `station-${one.station}`, autocomplete: "off", "aria-label": t("name of station {station}", one) });
+  row.append(h("label", {}, row.use, ` ${t("station {station}", one)}`), row.name, one.refusal ? h("span", { className: "soft" }, t("error reply: {refusal}", one)) : "");
   return row;
 }
 
 function showDraft({ draft, settings, said, left, gateway }) {
-  put("size", draft.size || "no tags yet");
+  put("size", draft.size || t("no tags yet"));
   byId("registers-card").hidden = byId("sheet-card").hidden = !draft.devices.length;
   showDevices(draft.devices);
   showSheetDevices(draft.devices, settings);
@@ -105,7 +106,7 @@ function showDraft({ draft, settings, said, left, gateway }) {
     const [name, before, load, advice] = row.children;
     put(name, one.line);
     const was = one.before ?? 0;
-    put(before, Math.abs(was - one.load) > 0.0005 ? `load of the wire ${percent(was)} →` : "load of the wire");
+    put(before, Math.abs(was - one.load) > 0.0005 ? `${t("load of the wire")} ${percent(was)} →` : t("load of the wire"));
     put(load, percent(one.load));
     style(load, one.load > 1 ? "load bad" : "load");
     put(advice, one.advice);
@@ -114,10 +115,10 @@ function showDraft({ draft, settings, said, left, gateway }) {
   const text = draft.difference.join("\n");
   if (byId("difference").shown !== text) {
     byId("difference").shown = text;
-    byId("difference").replaceChildren(...draft.difference.map((line) => h("span", { className: { "+": "plus", "-": "minus" }[line[0]] ?? "soft" }, line)), draft.more ? h("span", {}, `and ${draft.more} more lines`) : "");
+    byId("difference").replaceChildren(...draft.difference.map((line) => h("span", { className: { "+": "plus", "-": "minus" }[line[0]] ?? "soft" }, line)), draft.more ? h("span", {}, t("and {n} more lines", { n: draft.more })) : "");
   }
-  put("said", draft.changed ? "" : said || (draft.exists ? "The file has no change." : ""));
-  put("apply", draft.changed || gateway.state ? "Apply" : "Run the gateway");
+  put("said", draft.changed ? "" : said || (draft.exists ? t("The file has no change.") : ""));
+  put("apply", draft.changed || gateway.state ? t("Apply") : t("Run the gateway"));
   byId("apply").disabled = left !== null || draft.mistakes.length > 0 || !(draft.changed || (draft.exists && !gateway.state));
   byId("undo").disabled = !draft.steps;
 }
@@ -125,7 +126,7 @@ function showDraft({ draft, settings, said, left, gateway }) {
 function showTrial(left) {
   byId("trial").hidden = left === null;
   if (left === null) return;
-  put("trial-text", left < 0 ? "A change of this file was never kept." : `The gateway took the change over. It goes back in ${Math.ceil(left)} s.`);
+  put("trial-text", left < 0 ? t("A change of this file was never kept.") : t("The gateway took the change over. It goes back in {n} s.", { n: Math.ceil(left) }));
 }
 
 // -- values --
@@ -134,10 +135,10 @@ async function values() {
   if (!state?.gateway.state || document.hidden) return;
   const found = await call("values");
   const good = found.filter((one) => one.quality === "good").length;
-  put("good", `${good} of ${found.length} values are good`);
+  put("good", t("{n} of {all} values are good", { n: good, all: found.length }));
   found.sort((one, other) => one.tag.localeCompare(other.tag, undefined, { numeric: true }));
   keyed(byId("values"), found, (one) => one.tag, row, (item, one) => {
-    put(item.number, one.quality === "good" ? `${one.text ?? one.value} ${one.unit ?? ""}`.trim() : `bad: ${one.reason}`);
+    put(item.number, one.quality === "good" ? `${one.text ?? one.value} ${one.unit ?? ""}`.trim() : `${said("bad")}: ${said(one.reason)}`);
     style(item.number, one.quality === "good" ? "" : "bad");
     item.write.hidden = !one.write;
   });
@@ -146,27 +147,27 @@ async function values() {
 function row(one) {
   const item = h("li", {}, h("span", {}, one.tag));
   item.number = h("b");
-  item.write = h("button", { type: "button", className: "quiet", "aria-label": `write ${one.tag}`, onclick: () => editor(item, one) }, "Write");
+  item.write = h("button", { type: "button", className: "quiet", "aria-label": t("write {tag}", one), onclick: () => editor(item, one) }, t("Write"));
   item.append(item.number, item.write);
   return item;
 }
 
 function editor(item, { tag, unit, write, verify }) {
   if (item.querySelector("form")) return item.querySelector("form").remove();
-  const input = h("input", { required: true, autocomplete: "off", "aria-label": `new value of ${tag}` });
-  const send = h("button", { type: "submit", className: "main" }, "Write …");
+  const input = h("input", { required: true, autocomplete: "off", "aria-label": t("new value of {tag}", { tag }) });
+  const send = h("button", { type: "submit", className: "main" }, t("Write …"));
   const result = h("p", { className: "result", role: "alert" });
-  const limits = [write.min !== null && `at least ${write.min}`, write.max !== null && `at most ${write.max}`, verify && "read back"].filter(Boolean).join(", ");
+  const limits = listed([write.min !== null && t("at least {n}", { n: write.min }), write.max !== null && t("at most {n}", { n: write.max }), verify && t("read back")]);
   let armed = false;
-  input.addEventListener("input", () => { armed = false; put(send, "Write …"); });
+  input.addEventListener("input", () => { armed = false; put(send, t("Write …")); });
   item.append(h("form", { onsubmit: (event) => {
     event.preventDefault();
     armed = !armed;
-    if (armed) return put(send, `Confirm: ${input.value} ${unit ?? ""}`.trim());
-    put(send, "Write …");
+    if (armed) return put(send, t("Confirm: {value}", { value: `${input.value} ${unit ?? ""}`.trim() }));
+    put(send, t("Write …"));
     return step(send, result, async () => {
       const done = await call("write", { tag, value: input.value.trim() });
-      put(result, done.error ? `Not done: ${done.error}${done.reason ? `: ${done.reason}` : ""}` : `${done.value}: ${done.verified ? "acknowledged and read back" : "acknowledged"}`);
+      put(result, done.error ? t("Not done: {why}", { why: [done.error, done.reason].filter(Boolean).map(said).join(": ") }) : `${done.value}: ${done.verified ? t("acknowledged and read back") : t("acknowledged by the device")}`);
     });
   } }, input, unit ?? "", h("span", { className: "soft" }, limits), send, result));
   return input.focus();

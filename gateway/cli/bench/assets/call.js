@@ -1,6 +1,7 @@
 // Requests to the bench: an address that works once gives a token, which each request has.
 
 import { byId, put } from "./dom.js";
+import { said, t } from "./language.js";
 
 const TOKEN = "bench";
 
@@ -13,12 +14,12 @@ export async function enter() {
     if (!reply.ok) return lost(found.error);
     sessionStorage.setItem(TOKEN, found.token);
   }
-  return sessionStorage.getItem(TOKEN) ? true : lost("open the address that the terminal shows");
+  return sessionStorage.getItem(TOKEN) ? true : lost(t("open the address that the terminal shows"));
 }
 
 export function lost(why) {
   byId("lost").hidden = !why;
-  put("lost", why ? `Not connected: ${why}` : "");
+  put("lost", why ? t("Not connected: {why}", { why }) : "");
   return false;
 }
 
@@ -30,13 +31,13 @@ export async function call(path, data, body) {
   try {
     reply = await fetch(`api/${path}`, options);
   } catch {
-    lost("the bench has ended");
-    throw new Error("The bench has ended.");
+    lost(t("the bench has ended"));
+    throw new Error(t("The bench has ended."));
   }
   const found = await reply.json();
   if (reply.ok) return found;
-  if (reply.status === 401) lost("this bench is open in another place, or was started again: open its new address");
-  throw new Error(found.error);
+  if (reply.status === 401) lost(t("this bench is open in another place, or was started again: open its new address"));
+  throw new Error(said(found.error));
 }
 
 // Does a step of a button or a form, which waits for it; its sentence goes to `place`.

@@ -1,6 +1,7 @@
 // Registers live, in every type side by side: choose the right number, name the row, add the tags.
 
 import { byId, h, keyed, put, style } from "./dom.js";
+import { said, t } from "./language.js";
 import { call, step } from "./call.js";
 
 const EVERY = 400; // ms
@@ -36,7 +37,7 @@ export function showDevices(devices) {
   if (list.names === names) return;
   list.names = names;
   const was = list.value;
-  list.replaceChildren(...devices.map((one) => h("option", { value: one.device }, `${one.device} (${one.protocol}, station ${one.station})`)));
+  list.replaceChildren(...devices.map((one) => h("option", { value: one.device }, t("{device} ({protocol}, station {station})", one))));
   list.ranges = Object.fromEntries(devices.map((one) => [one.device, one.range]));
   if (devices.some((one) => one.device === was)) list.value = was;
   else byId("range").value = list.ranges[list.value] ?? "";
@@ -70,11 +71,11 @@ async function read() {
 
 function show(found) {
   if (found.device !== device) return;
-  put("look-error", found.error || (found.reads ? "" : "The registers are no longer read: choose Read."));
+  put("look-error", said(found.error) || (found.reads ? "" : t("The registers are no longer read: choose Read.")));
   const titles = found.columns.join();
   if (columns.join() !== titles || !byId("registers").tHead.rows.length) {
     columns = found.columns;
-    byId("registers").tHead.replaceChildren(h("tr", {}, ...["address", "name", ...columns].map((title) => h("th", {}, title))));
+    byId("registers").tHead.replaceChildren(h("tr", {}, ...[t("address"), t("name"), ...columns].map((title) => h("th", {}, title))));
   }
   keyed(byId("registers").tBodies[0], found.rows, (row) => row.address, made, update);
   byId("tags-form").hidden = !found.rows.length;
@@ -83,13 +84,13 @@ function show(found) {
 function made(row) {
   const line = h("tr", {}, h("td", {}, row.address));
   line.known = h("span", { className: "known" });
-  line.name = h("input", { className: "name", placeholder: "name", autocomplete: "off", spellcheck: false, "aria-label": `name of ${row.address}`, onpaste: (event) => paste(event, line) });
-  line.unit = h("input", { className: "unit", placeholder: "unit", autocomplete: "off", "aria-label": `unit of ${row.address}` });
-  line.scale = h("input", { className: "scale", autocomplete: "off", inputMode: "decimal", placeholder: "scale", "aria-label": `scale of ${row.address}` });
+  line.name = h("input", { className: "name", placeholder: t("name"), autocomplete: "off", spellcheck: false, "aria-label": t("name of {address}", row), onpaste: (event) => paste(event, line) });
+  line.unit = h("input", { className: "unit", placeholder: t("unit"), autocomplete: "off", "aria-label": t("unit of {address}", row) });
+  line.scale = h("input", { className: "scale", autocomplete: "off", inputMode: "decimal", placeholder: t("scale"), "aria-label": t("scale of {address}", row) });
   line.writes = h("input", { type: "checkbox", onchange: () => { line.least.hidden = line.most.hidden = !line.writes.checked; } });
-  line.least = h("input", { type: "number", step: "any", placeholder: "least", hidden: true, "aria-label": `least value of ${row.address}` });
-  line.most = h("input", { type: "number", step: "any", placeholder: "greatest", hidden: true, "aria-label": `greatest value of ${row.address}` });
-  line.append(h("td", {}, line.name, line.known, h("span", { className: "more" }, line.unit, line.scale, h("label", {}, line.writes, " may be written"), line.least, line.most)));
+  line.least = h("input", { type: "number", step: "any", placeholder: t("least"), hidden: true, "aria-label": t("least value of {address}", row) });
+  line.most = h("input", { type: "number", step: "any", placeholder: t("greatest"), hidden: true, "aria-label": t("greatest value of {address}", row) });
+  line.append(h("td", {}, line.name, line.known, h("span", { className: "more" }, line.unit, line.scale, h("label", {}, line.writes, ` ${t("may be written")}`), line.least, line.most)));
   line.cells_ = columns.map((title) => {
     const button = h("button", { type: "button", tabIndex: -1, "aria-pressed": "false", onclick: () => choose(line, row.address, title) });
     line.append(h("td", {}, button));
@@ -149,10 +150,10 @@ function settings(line) {
 
 async function add() {
   const lines = [...byId("registers").tBodies[0].rows].filter((line) => !line.name.hidden && line.name.value.trim());
-  if (!lines.length) throw new Error("Name a row first.");
+  if (!lines.length) throw new Error(t("Name a row first."));
   const names = lines.map((line) => line.name.value.trim());
   const twice = names.find((name, at) => names.indexOf(name) !== at);
-  if (twice) throw new Error(`${twice} is there twice.`);
+  if (twice) throw new Error(t("{name} is there twice.", { name: twice }));
   await call("tags", { device, tags: Object.fromEntries(lines.map((line) => [line.name.value.trim(), settings(line)])) });
   for (const line of lines) line.name.value = "";
   after();

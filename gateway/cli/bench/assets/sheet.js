@@ -1,6 +1,7 @@
 // Import with a preview: columns and the settings that they mean, first rows, mistakes; then add.
 
 import { byId, h, put } from "./dom.js";
+import { t } from "./language.js";
 import { call, step } from "./call.js";
 
 let columns = {}; // the title of each setting that was chosen
@@ -18,7 +19,7 @@ export function startSheet(changed) {
   byId("import").addEventListener("click", () => step(byId("import"), "sheet-said", async () => {
     const count = await call("import", asked());
     hide();
-    put("sheet-said", `${count} tags are in the change now.`);
+    put("sheet-said", t("{n} tags are in the change now.", { n: count }));
     byId("sheet").value = "";
     after();
   }));
@@ -44,22 +45,22 @@ function hide() {
 function show(found) {
   hide();
   const unknown = found.columns.filter((one) => one.title && !one.setting);
-  put("sheet-said", `${found.count} rows. ${unknown.length ? `Not used: ${unknown.map((one) => one.title).join(", ")}.` : "Every column is known."}`);
+  put("sheet-said", `${t("{n} rows.", { n: found.count })} ${unknown.length ? t("Not used: {columns}.", { columns: unknown.map((one) => one.title).join(", ") }) : t("Every column is known.")}`);
   byId("sheet-table").tHead.append(h("tr", {}, ...found.columns.map((one) => h("th", { className: one.setting ? "" : "unknown" }, one.title || one.letter, h("br"), picker(one)))));
   byId("sheet-table").tBodies[0].append(...found.rows.map((row) => h("tr", {}, ...found.columns.map((_, at) => h("td", {}, row[at] ?? "")))));
   byId("sheet-mistakes").append(...found.mistakes.map((one) => h("li", {}, one)));
   byId("sheet-tags").replaceChildren(...found.tags.map((one) => h("span", {}, one)));
   byId("sheet-tags").hidden = !found.tags.length;
   byId("import").hidden = !!found.mistakes.length;
-  put("import", `Import ${found.count} tags`);
+  put("import", t("Import {n} tags", { n: found.count }));
 }
 
 function picker({ title, setting }) {
-  const list = h("select", { "aria-label": `setting of column ${title}`, onchange: () => {
+  const list = h("select", { "aria-label": t("setting of column {title}", { title }), onchange: () => {
     for (const [name, one] of Object.entries(columns)) if (one === title) delete columns[name];
     if (list.value) columns[list.value] = title;
     again();
-  } }, h("option", { value: "" }, "not used"), ...[...new Set([...(setting ? [setting] : []), ...settings])].map((one) => h("option", { value: one }, one)));
+  } }, h("option", { value: "" }, t("not used")), ...[...new Set([...(setting ? [setting] : []), ...settings])].map((one) => h("option", { value: one }, one)));
   list.value = setting ?? "";
   return list;
 }

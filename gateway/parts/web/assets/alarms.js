@@ -1,6 +1,7 @@
 // Alarms that are not normal, each with its button.
 
 import { byId, h, keyed, moment, put, style } from "./dom.js";
+import { said, several, t } from "./language.js";
 import { api, gateway, on, operator, post, signedIn } from "./stream.js";
 
 const SHORT = 6; // in the overview
@@ -9,8 +10,8 @@ const MOST = 5000;
 const EVERY = 4000; // ms between two requests for what is not in the events
 const PAST_EVERY = 10_000; // ms
 const LEVELS = {
-  high_high: "far too high", high: "too high", low: "too low", low_low: "far too low", on: "on", off: "off",
-  offline: "offline", down: "down", silent: "silent", stopped: "stopped",
+  high_high: t("far too high"), high: t("too high"), low: t("too low"), low_low: t("far too low"), on: t("on"), off: t("off"),
+  offline: t("offline"), down: t("down"), silent: t("silent"), stopped: t("stopped"),
 };
 
 let all = [];
@@ -22,7 +23,7 @@ export const alarmsOf = (key) => byTag.get(key);
 export const onAlarms = (watcher) => watchers.push(watcher);
 
 on("state", async ({ alarms }) => {
-  if (!alarms?.shown) return put("alarms-head", "The alarms do not work now");
+  if (!alarms?.shown) return put("alarms-head", t("The alarms do not work now"));
   showSuppressed(alarms.suppressed);
   showPast(PAST_EVERY);
   if (!alarms.more) return takeAll(alarms.shown);
@@ -46,8 +47,8 @@ function takeAll(alarms) {
   put("alarm-count", String(open.length));
   byId("alarm-count").hidden = !open.length;
   byId("acknowledge-all").hidden = open.length < 2 || !gateway.you[1];
-  put("acknowledge-all", `Acknowledge all ${open.length}`);
-  put("alarms-head", all.length ? `Alarms: ${open.length} to acknowledge, ${all.length} in all` : "Alarms: none");
+  put("acknowledge-all", t("Acknowledge all {n}", { n: open.length }));
+  put("alarms-head", all.length ? t("Alarms: {n} to acknowledge, {all} in all", { n: open.length, all: all.length }) : t("Alarms: none"));
   showAll();
   for (const watcher of watchers) watcher();
 }
@@ -56,8 +57,8 @@ function showAll() {
   const full = !byId("view-alarms").hidden;
   const list = byId(full ? "alarms-list" : "alarms-short");
   keyed(list, full ? all : all.slice(0, SHORT), (one) => one.alarm, makeRow, showRow);
-  if (!all.length) list.append(h("li", { className: "soft" }, "None."));
-  else if (!full && all.length > SHORT) list.append(h("li", {}, h("a", { href: "#alarms" }, `and ${all.length - SHORT} more`)));
+  if (!all.length) list.append(h("li", { className: "soft" }, t("None.")));
+  else if (!full && all.length > SHORT) list.append(h("li", {}, h("a", { href: "#alarms" }, t("and {n} more", { n: all.length - SHORT }))));
 }
 
 addEventListener("hashchange", () => { showAll(); showPast(); });
@@ -71,11 +72,11 @@ async function showPast(every = 0) {
   const reply = await api("alarms/past", { time: `[now(-${byId("past-span").value})..]` }).catch(() => null);
   if (!reply) return;
   const rows = reply.ok ? reply.found.alarms : [];
-  put("past-why", reply.ok ? (rows.length ? "" : "Nothing.") : reply.found.error);
+  put("past-why", reply.ok ? (rows.length ? "" : t("Nothing.")) : said(reply.found.error));
   byId("past-list").replaceChildren(...rows.map((one) => {
     const by = one.event === "acknowledged" ? one.acknowledged.by : one.by;
-    const reason = (one.shelved ?? one.out_of_service)?.reason ?? (one.part_of && `part of ${one.part_of}`);
-    const words = [one.alarm, one.change ?? one.event, by && `by ${by}`, reason ?? why(one)];
+    const reason = (one.shelved ?? one.out_of_service)?.reason ?? (one.part_of && t("part of {alarm}", { alarm: one.part_of }));
+    const words = [one.alarm, said(one.change ?? one.event), by && t("by {name}", { name: by }), reason ?? why(one)];
     return h("li", { className: "soft" }, h("time", { dateTime: one.since }, moment(Date.parse(one.since))), ` ${words.filter(Boolean).join(" · ")}`);
   }));
 }
@@ -83,7 +84,7 @@ async function showPast(every = 0) {
 function why(one) {
   const limit = typeof one.limit === "number" ? ` (${one.limit})` : "";
   const level = { on: "", off: "", offline: "", down: "", silent: "", stopped: "" }[one.level] ?? `${LEVELS[one.level] ?? ""}${limit}`;
-  const text = one.text || one.alarm;
+  const text = one.text ? (one.alarm.includes("/") ? one.text : said(one.text)) : one.alarm; // that of a tag is of the file
   return [text, level].filter(Boolean).join(": ") || LEVELS[one.level];
 }
 
@@ -95,8 +96,8 @@ function makeRow() {
   row.count = h("summary");
   row.names = h("span");
   row.parts = h("details", {}, row.count, row.names);
-  row.button = h("button", { type: "button", onclick: () => acknowledge(row.alarm) }, "Acknowledge");
-  row.shelve = h("button", { type: "button", onclick: () => shelve(row.alarm) }, "Shelve …");
+  row.button = h("button", { type: "button", onclick: () => acknowledge(row.alarm) }, t("Acknowledge"));
+  row.shelve = h("button", { type: "button", onclick: () => shelve(row.alarm) }, t("Shelve …"));
   row.append(h("div", {}, row.why, row.detail, row.where, row.parts), h("div", { className: "bar" }, row.button, row.shelve));
   return row;
 }
@@ -104,20 +105,21 @@ function makeRow() {
 function showRow(row, one) {
   row.alarm = one;
   const { quality, reason, value, unit, acknowledged, state } = one;
-  const text = typeof value === "boolean" || value === "true" || value === "false" ? "" : quality === "good" ? `${value} ${unit}`.trim() : `bad: ${reason ?? "not known"}`;
+  const text = typeof value === "boolean" || value === "true" || value === "false" ? "" : quality === "good" ? `${value} ${unit}`.trim() : `${said("bad")}: ${said(reason ?? "not known")}`;
   put(row.why, one.why);
-  put(row.detail, one.detail && !one.why.includes(one.detail) ? one.detail : "");
+  put(row.detail, one.detail && !one.why.includes(one.detail) ? said(one.detail) : "");
   const done = state === "acknowledged";
-  const by = done ? `acknowledged by ${acknowledged.by}, ${moment(Date.parse(acknowledged.time))}` : `${state} since ${moment(Date.parse(one.since))}`;
-  put(row.where, [one.priority, one.alarm.replace(/^line:/, "line "), "time" in one ? text : "", by].filter(Boolean).join(" · "));
+  const time = moment(Date.parse(done ? acknowledged.time : one.since));
+  const by = done ? t("acknowledged by {name}, {time}", { name: acknowledged.by, time }) : state === "active" ? t("active since {time}", { time }) : t("returned since {time}", { time });
+  put(row.where, [said(one.priority), one.alarm.replace(/^line:/, `${t("line")} `), "time" in one ? text : "", by].filter(Boolean).join(" · "));
   const parts = one.devices ?? [];
   row.parts.hidden = !parts.length;
-  put(row.count, `${parts.length} devices`);
+  put(row.count, several(parts.length, "{n} device", "{n} devices"));
   put(row.names, parts.join(", "));
   row.button.hidden = done || !gateway.you[1];
-  row.button.setAttribute("aria-label", `acknowledge ${one.alarm}`);
+  row.button.setAttribute("aria-label", t("acknowledge {alarm}", one));
   row.shelve.hidden = !gateway.you[1];
-  row.shelve.setAttribute("aria-label", `shelve ${one.alarm}`);
+  row.shelve.setAttribute("aria-label", t("shelve {alarm}", one));
   style(row, `alarm ${state}`);
 }
 
@@ -130,7 +132,7 @@ function makeSuppressed() {
   const row = h("li", { className: "alarm" });
   row.why = h("b", { className: "why" });
   row.where = h("span", { className: "where" });
-  row.button = h("button", { type: "button", onclick: () => order(row.alarm, { do: row.alarm.shelved ? "unshelve" : "in-service" }, "put back") }, "Put back");
+  row.button = h("button", { type: "button", onclick: () => order(row.alarm, { do: row.alarm.shelved ? "unshelve" : "in-service" }, t("put back")) }, t("Put back"));
   row.append(h("div", {}, row.why, row.where), row.button);
   return row;
 }
@@ -138,11 +140,11 @@ function makeSuppressed() {
 function showRest(row, one) {
   row.alarm = one;
   const what = one.shelved ?? one.out_of_service;
-  const until = one.shelved ? `shelved until ${moment(Date.parse(what.until))}` : `out of service since ${moment(Date.parse(what.time))}`;
+  const until = one.shelved ? t("shelved until {time}", { time: moment(Date.parse(what.until)) }) : t("out of service since {time}", { time: moment(Date.parse(what.time)) });
   put(row.why, why(one));
-  put(row.where, [one.priority, one.alarm, `${until} by ${what.by}`, what.reason].join(" · "));
+  put(row.where, [said(one.priority), one.alarm, `${until} ${t("by {name}", { name: what.by })}`, what.reason].join(" · "));
   row.button.hidden = !gateway.you[1];
-  row.button.setAttribute("aria-label", `put ${one.alarm} back`);
+  row.button.setAttribute("aria-label", t("put {alarm} back", one));
 }
 
 let asking = null; // the alarm of the dialog
@@ -150,7 +152,7 @@ let asking = null; // the alarm of the dialog
 async function shelve(one) {
   if (!(await signedIn())) return;
   asking = one;
-  put("shelve-title", `Shelve ${one.alarm}`);
+  put("shelve-title", t("Shelve {alarm}", one));
   byId("shelve").showModal();
 }
 
@@ -158,16 +160,16 @@ byId("shelve-cancel").addEventListener("click", () => byId("shelve").close());
 byId("shelve-form").addEventListener("submit", () => {
   const seconds = Number(byId("shelve-for").value);
   const fields = { do: seconds ? "shelve" : "out-of-service", reason: byId("shelve-reason").value, ...(seconds && { seconds }) };
-  order(asking, fields, seconds ? "shelved" : "taken out of service");
+  order(asking, fields, seconds ? t("shelved") : t("taken out of service"));
 });
 
 async function order({ alarm }, fields, done) {
   if (!(await signedIn())) return;
   try {
     const { ok, found } = await post("alarms/order", { alarm }, JSON.stringify({ by: operator(), ...fields }));
-    put("acknowledge-result", `${alarm}: ${ok ? done : found.reason ?? found.error}`);
+    put("acknowledge-result", `${alarm}: ${ok ? done : said(found.reason ?? found.error)}`);
   } catch {
-    put("acknowledge-result", `${alarm}: the connection ended; it is not known whether it was ${done}`);
+    put("acknowledge-result", `${alarm}: ${t("the connection ended; it is not known whether it is done")}`);
   }
 }
 
@@ -177,20 +179,20 @@ async function acknowledge(...alarms) {
   let done = 0;
   const wrong = [];
   for (const { alarm, raised } of alarms) {
-    put("acknowledge-result", `acknowledging ${alarm} …`);
+    put("acknowledge-result", t("acknowledging {alarm} …", { alarm }));
     try {
       const { ok, found } = await post("alarms/acknowledge", { alarm }, JSON.stringify({ by: operator(), raised }));
-      if (!ok) wrong.push(`${alarm}: ${found.reason ?? found.error}`);
+      if (!ok) wrong.push(`${alarm}: ${said(found.reason ?? found.error)}`);
       else {
         done += 1;
         takeAll(all.map((one) => (one.alarm === alarm ? found : one)).filter((one) => one.state !== "normal"));
       }
     } catch {
-      wrong.push(`${alarm}: the connection ended; it is not known whether it was acknowledged`);
+      wrong.push(`${alarm}: ${t("the connection ended; it is not known whether it is done")}`);
       break;
     }
   }
-  const first = done === 1 && alarms.length === 1 ? `${alarms[0].alarm}: acknowledged` : done ? `${done} alarms acknowledged` : "";
+  const first = done === 1 && alarms.length === 1 ? `${alarms[0].alarm}: ${t("acknowledged")}` : done ? several(done, "{n} alarm acknowledged", "{n} alarms acknowledged") : "";
   put("acknowledge-result", [first, ...wrong.slice(0, 5)].filter(Boolean).join(". "));
 }
 

@@ -1,5 +1,7 @@
 // Small helpers: elements, text, times.
 
+import { dates, t } from "./language.js";
+
 export const byId = (id) => document.getElementById(id);
 
 // Makes an element: properties, `data-…`, `aria-…` and `role` as attributes, `on…` as listeners.
@@ -50,18 +52,18 @@ export function keyed(list, items, key, make, update) {
   }
 }
 
-export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour12: false });
+export const clock = (ms) => new Date(ms).toLocaleTimeString(dates, { hour12: false });
 
 export function moment(ms) {
   if (Number.isNaN(ms)) return "";
-  return Math.abs(Date.now() - ms) < 86400e3 ? clock(ms) : new Date(ms).toLocaleString([], { hour12: false });
+  return Math.abs(Date.now() - ms) < 86400e3 ? clock(ms) : new Date(ms).toLocaleString(dates, { hour12: false });
 }
 
 export function span(seconds) {
-  if (seconds < 10) return `${seconds.toFixed(1)} s`;
-  if (seconds < 120) return `${Math.round(seconds)} s`;
-  if (seconds < 7200) return `${Math.round(seconds / 60)} min`;
-  return seconds < 172800 ? `${Math.round(seconds / 3600)} h` : `${Math.round(seconds / 86400)} d`;
+  if (seconds < 10) return t("{n} s", { n: seconds.toFixed(1) });
+  if (seconds < 120) return t("{n} s", { n: Math.round(seconds) });
+  if (seconds < 7200) return t("{n} min", { n: Math.round(seconds / 60) });
+  return seconds < 172800 ? t("{n} h", { n: Math.round(seconds / 3600) }) : t("{n} d", { n: Math.round(seconds / 86400) });
 }
 
 // The view and its choices are in the address, so that a link or a wall display keeps them.

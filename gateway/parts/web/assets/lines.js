@@ -1,6 +1,7 @@
 // What is wrong, the lines with their causes, devices folded below; calls and transfers.
 
 import { byId, clock, h, keyed, moment, put, span, style, svg } from "./dom.js";
+import { listed, said, several, t, whole } from "./language.js";
 import { gateway, now, on, post, signedIn } from "./stream.js";
 import { wireOf } from "./wire.js";
 
@@ -30,10 +31,9 @@ let begun = false; // the next state has all devices and transfers
 on("state", (state) => {
   if (begun) for (const known of [devices, transfers, timelines]) known.clear();
   begun = false;
-  const waiting = state.standby ? `, ${state.standby}` : "";
-  const history = state.history === null ? "no history" : state.history === "ok" ? "history ok" : "history not ok";
+  const history = state.history === null ? t("no history") : state.history === "ok" ? t("history ok") : t("history not ok");
   put("name", state.name);
-  put("about", `plc-gateway ${state.version}, up ${span(state.up)}, ${state.tags} tags, ${state.links.length} Zenoh ${state.links.length === 1 ? "link" : "links"}, ${history}${waiting}${state.you[1] ? "" : ", read only"}`);
+  put("about", listed([`plc-gateway ${state.version}`, t("up {span}", { span: span(state.up) }), several(state.tags, "{n} tag", "{n} tags"), several(state.links.length, "{n} Zenoh link", "{n} Zenoh links"), history, said(state.standby), !state.you[1] && t("read only")]));
   lines = state.lines;
   doors = state.doors;
   origins = state.origins;
@@ -60,10 +60,10 @@ function merge(into, changes) {
 
 function showWrong(state) {
   const sentences = [
-    ...(state.ready ? [] : [["warning", "The gateway does not serve its plant: it starts, or is the standby."]]),
+    ...(state.ready ? [] : [["warning", t("The gateway does not serve its plant: it starts, or is the standby.")]]),
     ...state.faults.map((text) => ["wrong", text]),
     ...state.warnings.map((text) => ["warning", text]),
-    ...(state.more ? [["warning", `and ${state.more} more`]] : []),
+    ...(state.more ? [["warning", t("and {n} more", { n: state.more })]] : []),
   ];
   const count = state.faults.length;
   put("fault-count", String(count));
@@ -87,42 +87,44 @@ function showWrong(state) {
     put(item.head, head + item.colon);
     put(item.rest, rest);
   });
-  if (!sentences.length) list.append(h("li", { className: "well" }, "Nothing is wrong."));
+  if (!sentences.length) list.append(h("li", { className: "well" }, t("Nothing is wrong.")));
   if (sentences.length > SHORT) {
     const fold = () => {
       all = !all;
       showWrong(state);
     };
-    list.append(h("li", { className: "fold" }, h("button", { type: "button", className: "link", onclick: fold }, all ? "Show less" : `and ${sentences.length - SHORT} more`)));
+    list.append(h("li", { className: "fold" }, h("button", { type: "button", className: "link", onclick: fold }, all ? t("Show less") : t("and {n} more", { n: sentences.length - SHORT }))));
   }
 }
 
 const TIMES = / \(for .*?\)|\d+% of the last \d+ requests/g; // what changes in a sentence
 
+const HEAD = new RegExp(`^(${t("line")} [^\\s：]+?(?:: |：)[^:：]*|[^:：]*)([:：] ?(.*))?$`, "s");
+
 // A sentence in two: what is wrong, and its cause.
 function parted(text) {
-  const [, head, , rest = ""] = text.match(/^(line \S+: [^:]*|[^:]*)(: (.*))?$/s) ?? [null, text];
+  const [, head, , rest = ""] = said(text).match(HEAD) ?? [null, said(text)];
   return { head, rest };
 }
 
 // -- lines --
 
 function stateOf([name, open]) {
-  return open ? (origins[name] ?? "open") : "down";
+  return said(open ? (origins[name] ?? "open") : "down");
 }
 
 // Returns [kind, sentence] of each cause.
 function causesOf([name, open, trouble, , , faults, warnings]) {
   const own = new RegExp(`^line ${name.replace(/[.*+?^${}()|[\]\\]/g, "\\$&")}(: | is (down: )?|, )`);
   const found = [...faults.map((text) => ["wrong", text.replace(own, "")]), ...warnings.map((text) => ["warning", text.replace(own, "")])];
-  return found.length || open ? found : [["warning", trouble || "not opened"]];
+  return found.length || open ? found : [["warning", trouble || "not opened yet"]];
 }
 
 function showLines() {
   const worst = [...lines].sort((a, b) => Number(a[1]) - Number(b[1]) || b[5].length - a[5].length || b[6].length - a[6].length);
   if (byId("view-lines").hidden) {
     keyed(byId("lines-short"), worst.slice(0, LINES), ([name]) => name, makeShort, showShort);
-    if (worst.length > LINES) byId("lines-short").append(h("li", {}, h("a", { href: "#lines" }, `and ${worst.length - LINES} more`)));
+    if (worst.length > LINES) byId("lines-short").append(h("li", {}, h("a", { href: "#lines" }, t("and {n} more", { n: worst.length - LINES }))));
   } else {
     keyed(byId("lines-list"), worst, ([name]) => name, makeLine, showLine);
   }
@@ -143,11 +145,11 @@ function showShort(row, line) {
   const of = ownDevices(line[0]);
   const up = of.filter(([, [, state]]) => state === "up").length;
   const [[kind, cause] = ["soft", ""]] = causesOf(line);
-  put(row.state, `${stateOf(line)} · ${up} of ${of.length} ${of.length === 1 ? "device" : "devices"} up`);
+  put(row.state, `${stateOf(line)} · ${several(of.length, "{up} of {n} device up", "{up} of {n} devices up", { up })}`);
   style(row.state, kind);
   put(row.load, line[1] ? load(line[0]) : "");
-  put(row.cause, line[1] ? parted(cause).head : cause);
-  row.cause.title = cause;
+  put(row.cause, line[1] ? parted(cause).head : said(cause));
+  row.cause.title = said(cause);
 }
 
 function ownDevices(line) {
@@ -175,7 +177,7 @@ function makeLine([name]) {
   card.devices = h("ul", { className: "rows" });
   card.wire = h("div");
   card.fold = h("details", { ontoggle: () => showDevices(card, name) }, card.summary, card.devices);
-  card.button = h("button", { type: "button", className: "quiet", "aria-label": `wire of ${name}`, onclick: () => wireOf(name, card.wire, card.button) }, "Wire");
+  card.button = h("button", { type: "button", className: "quiet", "aria-label": t("wire of {name}", { name }), onclick: () => wireOf(name, card.wire, card.button) }, t("Wire"));
   card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, card.past, card.timeline, card.doors, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
   return card;
 }
@@ -200,22 +202,22 @@ function showLine(card, line) {
   keyed(card.doors, doors.filter(([, of]) => of === name), ([door]) => door, ([door]) => {
     const item = h("li");
     item.text = h("span");
-    item.button = h("button", { type: "button", className: "quiet write", "aria-label": `disconnect the programs of ${door}`, onclick: () => release(door, item) }, "Disconnect");
+    item.button = h("button", { type: "button", className: "quiet write", "aria-label": t("disconnect the programs of {door}", { door }), onclick: () => release(door, item) }, t("Disconnect"));
     item.append(item.text, item.button);
     return item;
   }, (item, [door, , share, programs]) => {
-    const shown = programs.slice(0, SHORT).map(([address, since]) => `${address} for ${span(since)}`).join(", ");
-    const more = programs.length > SHORT ? ` and ${programs.length - SHORT} more` : "";
-    put(item.text, item.result ?? `door ${door}, ${Math.round(share * 100)} % of the wire: ${shown}${more} `);
+    const shown = programs.slice(0, SHORT).map(([address, since]) => t("{address} for {span}", { address, span: span(since) })).join(t(", "));
+    const more = programs.length > SHORT ? ` ${t("and {n} more", { n: programs.length - SHORT })}` : "";
+    put(item.text, item.result ?? `${t("door {door}, {share} % of the wire: {programs}", { door, share: Math.round(share * 100), programs: shown })}${more} `);
   });
   const known = loads.get(name) ?? [];
   const step = 360 / Math.max(60, known.length); // five minutes at least
   card.chart.firstChild.setAttribute("points", known.map((share, at) => `${360 - (known.length - 1 - at) * step},${20 - share * 18}`).join(" "));
-  card.chart.setAttribute("aria-label", `load of ${name}, highest ${Math.round(Math.max(0, ...known) * 100)} %`);
-  put(card.load, `load ${load(name) || "–"}, expected ${Math.round(expected * 100)} %${rate === null ? "" : `, ${rate.toFixed(1)} requests/s`}`);
+  card.chart.setAttribute("aria-label", t("load of {name}, highest {n} %", { name, n: Math.round(Math.max(0, ...known) * 100) }));
+  put(card.load, listed([t("load {n}", { n: load(name) || "–" }), t("expected {n} %", { n: Math.round(expected * 100) }), rate !== null && t("{n} requests/s", { n: rate.toFixed(1) })]));
   const of = ownDevices(name);
   const up = of.filter(([, [, state]]) => state === "up").length;
-  put(card.summary, `${of.length} ${of.length === 1 ? "device" : "devices"}, ${up} up`);
+  put(card.summary, several(of.length, "{n} device, {up} up", "{n} devices, {up} up", { up }));
   showDevices(card, name, of);
 }
 
@@ -227,26 +229,26 @@ function showTimeline(card, name, states) {
   const spans = states.map(([time, kind, cause], at) => ({ time, kind, cause, end: states[at + 1]?.[0] ?? until })).filter(({ end }) => end >= from);
   card.past.replaceChildren(...spans.map(({ time, kind, cause, end }) => {
     const part = svg("rect", { x: x(time), width: Math.max(x(end) - x(time), 2), height: 10, class: kind });
-    part.append(Object.assign(svg("title"), { textContent: `${clock(time)}: ${cause || kind}` }));
+    part.append(Object.assign(svg("title"), { textContent: `${clock(time)}: ${said(cause || kind)}` }));
     return part;
   }));
-  card.past.setAttribute("aria-label", `states of ${name} in the last ${span((until - from) / 1000)}`);
+  card.past.setAttribute("aria-label", t("states of {name} in the last {span}", { name, span: span((until - from) / 1000) }));
   const changes = Math.max(0, spans.length - 1);
-  put(card.changes, `${changes} ${changes === 1 ? "change" : "changes"} in the last ${span((until - from) / 1000)}`);
-  keyed(card.states, spans.reverse().slice(0, SHOWN_STATES), ({ time }) => time, ({ kind }) => h("li", { className: kind }), (item, { time, kind, cause, end }) => put(item, `${moment(time)}, ${span((end - time) / 1000)}: ${cause || kind}`));
+  put(card.changes, several(changes, "{n} change in the last {span}", "{n} changes in the last {span}", { span: span((until - from) / 1000) }));
+  keyed(card.states, spans.reverse().slice(0, SHOWN_STATES), ({ time }) => time, ({ kind }) => h("li", { className: kind }), (item, { time, kind, cause, end }) => put(item, `${moment(time)}, ${span((end - time) / 1000)}: ${said(cause || kind)}`));
 }
 
 async function release(door, item) {
   if (!(await signedIn())) return;
   if (!item.armed) {
     item.armed = true;
-    return put(item.button, "Confirm: disconnect");
+    return put(item.button, t("Confirm: disconnect"));
   }
   try {
     const { ok, found } = await post("doors/release", { door }, '{"do": "release"}');
-    item.result = ok ? `door ${door}: disconnected ` : `door ${door}: ${found.reason ?? found.error} `;
+    item.result = `${t("door {door}", { door })}: ${ok ? t("disconnected") : said(found.reason ?? found.error)} `;
   } catch {
-    item.result = `door ${door}: the connection ended; it is not known whether it was disconnected `;
+    item.result = `${t("door {door}", { door })}: ${t("the connection ended; it is not known whether it is done")} `;
   }
   put(item.text, item.result);
 }
@@ -260,11 +262,11 @@ function showDevices(card, name, of = ownDevices(name)) {
     row.append(h("a", { href: `#tags?device=${encodeURIComponent(device)}` }, device), row.state, row.why);
     return row;
   }, (row, [, [, state, why]]) => {
-    put(row.state, state);
+    put(row.state, said(state));
     style(row.state, state);
-    put(row.why, why);
+    put(row.why, said(why));
   });
-  if (of.length > SHOWN) card.devices.append(h("li", { className: "soft" }, `and ${of.length - SHOWN} more: use the search`));
+  if (of.length > SHOWN) card.devices.append(h("li", { className: "soft" }, t("and {n} more: use the search", { n: of.length - SHOWN })));
 }
 
 // -- calls and transfers --
@@ -278,9 +280,9 @@ function showCalls(calls) {
     row.append(h("b", {}, line), row.state, row.more);
     return row;
   }, (row, [, state, since, next, result, made, failed]) => {
-    put(row.state, since === null ? state : `${state} for ${span(since)}`);
+    put(row.state, since === null ? said(state) : t("{state} for {span}", { state: said(state), span: span(since) }));
     style(row.state, state);
-    put(row.more, [next === null ? "" : `next call in ${span(next)}`, result && `last result ${result}`, `${made} calls, ${failed} failed`].filter(Boolean).join(", "));
+    put(row.more, listed([next !== null && t("next call in {span}", { span: span(next) }), result && t("last result {result}", { result: said(result) }), t("{n} calls, {failed} failed", { n: made, failed })]));
   });
 }
 
@@ -295,18 +297,18 @@ function showTransfers() {
     row.state = h("span");
     row.when = h("span", { className: "age" });
     row.why = h("p", { className: "cause" });
-    row.append(h("b", {}, `${number}: ${from} to ${to}`), row.state, row.when, row.why);
+    row.append(h("b", {}, t("{number}: {from} to {to}", { number, from, to })), row.state, row.when, row.why);
     return row;
   }, (row, [, [, , state, code, time, why]]) => {
-    put(row.state, state);
+    put(row.state, said(state));
     style(row.state, state);
     const at = Date.parse(time);
-    put(row.when, !time ? "never carried" : now() ? `${span(Math.max(0, (now() - at) / 1000))} ago` : "");
+    put(row.when, !time ? t("never carried") : now() ? t("{span} ago", { span: span(Math.max(0, (now() - at) / 1000)) }) : "");
     row.when.title = time ? clock(at) : "";
-    put(row.why, [why, code].filter(Boolean).join(" · "));
+    put(row.why, [said(why), said(code)].filter(Boolean).join(" · "));
   });
   const working = sorted.filter(([, one]) => one[2] === "carried").length;
-  put("transfer-count", `${working} of ${sorted.length} carry their value${sorted.length > SHOWN ? `; ${SHOWN} are shown` : ""}`);
+  put("transfer-count", [t("{n} of {all} carry their value", { n: whole(working), all: whole(sorted.length) }), sorted.length > SHOWN && t("{n} are shown", { n: SHOWN })].filter(Boolean).join("; "));
 }
 
 on("tick", () => gateway.live && showTransfers());

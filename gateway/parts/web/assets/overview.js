@@ -1,6 +1,7 @@
 // The overview: chosen tags as tiles, with their alarms, beside what is wrong.
 
 import { byId, h, keyed, put, style } from "./dom.js";
+import { t } from "./language.js";
 import { api, follow, gateway, on, onLive } from "./stream.js";
 import { describe, drawSpark, limits, notCurrent, showParts, sparkline, tagOf, take, title, valueParts } from "./values.js";
 import { alarmsOf, onAlarms } from "./alarms.js";
@@ -46,9 +47,9 @@ function showTiles(keys) {
   keyed(byId("tiles"), keys, (key) => key, makeTile, showTile);
   fill();
   showAll();
-  if (!keys.length) byId("tiles").replaceChildren(h("li", { className: "soft" }, "No tag is chosen."));
+  if (!keys.length) byId("tiles").replaceChildren(h("li", { className: "soft" }, t("No tag is chosen.")));
   byId("chosen").replaceChildren(
-    ...(pinned ? ["Chosen on this page. ", h("button", { type: "button", className: "link", onclick: unpin }, "Show the choice of the file")] : []),
+    ...(pinned ? [t("Chosen on this page."), " ", h("button", { type: "button", className: "link", onclick: unpin }, t("Show the choice of the file"))] : []),
   );
 }
 
@@ -100,7 +101,7 @@ function makeTile(key) {
   if (meta.description) put(tile.about, `${device} · ${meta.description}`);
   tile.append(
     h("div", { className: "bar" },
-      h("a", { className: "name", href: `#trend?tags=${encodeURIComponent(key)}`, title: title({ meta }) }, rest.join("/"), h("span", { className: "hidden" }, `, trend of ${key}`)),
+      h("a", { className: "name", href: `#trend?tags=${encodeURIComponent(key)}`, title: title({ meta }) }, rest.join("/"), h("span", { className: "hidden" }, `, ${t("trend of {key}", { key })}`)),
       meta.write && writeButton(key)),
     tile.about, parts.value, tile.spark, tile.alarm,
     h("p", { className: "foot" }, parts.quality, tile.limits, parts.age),

@@ -2,6 +2,7 @@
 // late, nothing is live at once.
 
 import { byId, put, clock } from "./dom.js";
+import { said, t } from "./language.js";
 
 const SILENT = 2500; // ms without an event until nothing is live
 const LATE = 3000; // ms that an event may be later than the fastest one
@@ -71,14 +72,14 @@ on("state", ({ you }) => {
   const [name, mayWrite] = you;
   byId("account").hidden = !mayWrite;
   document.documentElement.classList.toggle("read-only", !mayWrite);
-  put("account", name ? `${name}: sign out` : "Sign in");
+  put("account", name ? t("{name}: sign out", { name }) : t("Sign in"));
   if (!asked || !sessionStorage.getItem("token")) return;
   if (name) {
     byId("token").value = "";
     answered(true);
   } else {
     sessionStorage.removeItem("token");
-    put("sign-in-why", "The gateway does not know this token.");
+    put("sign-in-why", t("The gateway does not know this token."));
   }
 });
 
@@ -101,10 +102,10 @@ export const post = (path, query, body) =>
 function setLive(live, why = "") {
   gateway.live = live;
   document.body.classList.toggle("stale", !live);
-  const since = serverTime ? `Not live since ${clock(serverTime)}` : "Not connected";
-  put("live", live ? "live" : serverTime ? "not live" : "connecting …");
+  const since = serverTime ? t("Not live since {time}", { time: clock(serverTime) }) : t("Not connected");
+  put("live", live ? t("live") : serverTime ? t("not live") : t("connecting …"));
   byId("lost").hidden = live || (!serverTime && !why);
-  put("lost", live ? "" : `${since}${why ? `: ${why}` : ""}. What is shown here may be old.`);
+  put("lost", live ? "" : `${since}${why ? `: ${said(why)}` : ""}. ${t("What is shown here may be old.")}`);
   for (const watcher of watchers) watcher(live);
 }
 
@@ -114,7 +115,7 @@ function slept() {
   awake = Date.now();
   if (Math.abs(awake - before) < SLEPT) return false;
   if (!document.hidden) {
-    setLive(false, "the page slept");
+    setLive(false, t("the page slept"));
     follow();
   }
   return true;
@@ -122,7 +123,7 @@ function slept() {
 
 setInterval(() => {
   if (slept()) return;
-  if (gateway.live && performance.now() - heard > SILENT) setLive(false, "no event arrives");
+  if (gateway.live && performance.now() - heard > SILENT) setLive(false, t("no event arrives"));
   for (const taker of takers.tick ?? []) taker();
 }, 500);
 
@@ -141,17 +142,17 @@ async function run() {
   while (stream === mine) {
     fastest = Infinity;
     for (const taker of takers.begin ?? []) taker();
-    let why = "the connection ended";
+    let why = t("the connection ended");
     try {
       const reply = await fetch(`api/events?${query}`, { headers: headers(), signal: mine.signal, cache: "no-store" });
       if (reply.ok) await read(reply.body, mine);
       else {
         why = (await reply.json()).error;
-        if (reply.status === 401 && stream === mine) signedIn(sessionStorage.getItem("token") ? "The gateway does not know this token." : "This gateway shows its values with a token.");
+        if (reply.status === 401 && stream === mine) signedIn(sessionStorage.getItem("token") ? t("The gateway does not know this token.") : t("This gateway shows its values with a token."));
       }
     } catch {
       if (mine.signal.aborted) return;
-      why = "no connection to the gateway";
+      why = t("no connection to the gateway");
     }
     if (stream !== mine) return;
     setLive(false, why);
@@ -181,7 +182,7 @@ function takeTime([time, steady]) {
   heard = performance.now();
   const behind = heard - steady;
   fastest = Math.min(fastest, behind);
-  if (behind - fastest > LATE) return setLive(false, "events are late"); // they wait on their way
+  if (behind - fastest > LATE) return setLive(false, t("events are late")); // they wait on their way
   serverTime = time;
   setLive(true);
   for (const taker of takers.time ?? []) taker();

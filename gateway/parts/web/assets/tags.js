@@ -1,6 +1,7 @@
 // All tags in a list of which only the rows in sight exist, and the one search over tags and devices.
 
 import { byId, go, h, keyed, place, put, style } from "./dom.js";
+import { said, several, t } from "./language.js";
 import { api, gateway, on, onLive } from "./stream.js";
 import { limits, showParts, tagOf, takeSample, title, valueParts } from "./values.js";
 import { alarmsOf } from "./alarms.js";
@@ -61,17 +62,17 @@ function showChips() {
     const chosen = question.device === name;
     chip.link = h("a", { href: chosen ? "#tags" : `#tags?device=${encodeURIComponent(name)}` });
     chip.state = h("span");
-    chip.link.append(h("b", {}, name), ` on ${line} `, chip.state, chosen ? " ✕" : "");
-    if (chosen) chip.link.setAttribute("aria-label", `show all tags, not only those of ${name}`);
+    chip.link.append(h("b", {}, name), ` ${t("on {line}", { line })} `, chip.state, chosen ? " ✕" : "");
+    if (chosen) chip.link.setAttribute("aria-label", t("show all tags, not only those of {name}", { name }));
     chip.why = h("span", { className: "why" });
     chip.append(chip.link, chip.why);
     return chip;
   }, (chip, [, [, state, why]]) => {
-    put(chip.state, state);
+    put(chip.state, said(state));
     style(chip.state, state);
-    put(chip.why, question.device ? why : "");
+    put(chip.why, question.device ? said(why) : "");
   });
-  if (found.length > CHIPS) byId("found-devices").append(h("li", { className: "soft" }, `and ${found.length - CHIPS} more devices`));
+  if (found.length > CHIPS) byId("found-devices").append(h("li", { className: "soft" }, t("and {n} more devices", { n: found.length - CHIPS })));
 }
 
 on("state", () => inView() && showChips());
@@ -96,11 +97,11 @@ async function ask() {
   if (mine !== asking) return;
   asking = null;
   if (!reply || asked !== question) return;
-  if (!reply.ok) return put("tags-title", reply.found.error);
+  if (!reply.ok) return put("tags-title", said(reply.found.error));
   begun = at;
   total = reply.found.total;
   reply.found.tags.forEach((found, number) => (keys[first + number] = takeSample(found).key));
-  put("tags-title", `${total.toLocaleString("en")} ${total === 1 ? "tag" : "tags"}${asked.device ? ` of ${asked.device}` : ""}${asked.find ? ` with “${asked.find}”` : ""}`);
+  put("tags-title", [several(total, "{n} tag", "{n} tags"), asked.device && t("of {device}", asked), asked.find && t("with “{find}”", asked)].filter(Boolean).join(" "));
   draw();
 }
 
@@ -138,7 +139,7 @@ function makeRow(number) {
     row.parts.age,
     h("span", { role: "cell", className: "actions" },
       meta.write && writeButton(key),
-      !meta.length && meta.type !== "string" && h("a", { className: "button quiet", href: `#trend?tags=${encodeURIComponent(key)}`, "aria-label": `trend of ${key}` }, "Trend"),
+      !meta.length && meta.type !== "string" && h("a", { className: "button quiet", href: `#trend?tags=${encodeURIComponent(key)}`, "aria-label": t("trend of {key}", { key }) }, t("Trend")),
       row.star));
   row.parts.age.setAttribute("role", "cell");
   return row;
@@ -153,8 +154,8 @@ function showRow(row) {
   put(row.star, pinned ? "★" : "☆");
   row.star.setAttribute("aria-pressed", String(pinned));
   if (!row.star.title) {
-    row.star.title = "On the overview";
-    row.star.setAttribute("aria-label", `${row.tag} on the overview`);
+    row.star.title = t("On the overview");
+    row.star.setAttribute("aria-label", t("{tag} on the overview", row));
   }
   const alarm = alarmsOf(row.tag);
   row.title = alarm?.why ?? "";

@@ -2,12 +2,13 @@
 // was valid. Drawn by uPlot, which is loaded when the first trend is opened.
 
 import { byId, clock, go, h, keyed, place, put } from "./dom.js";
+import { dates, said, t } from "./language.js";
 import { api, gateway, now, on, onLive } from "./stream.js";
 import { showParts, tagOf, takeSample, title, valueParts, written } from "./values.js";
 import { writeButton } from "./writing.js";
 
 const MOST = 8; // tags
-const SPANS = { "5 min": 300, "1 h": 3600, "8 h": 28800, "1 d": 86400, "7 d": 604800, "30 d": 2592000 };
+const SPANS = [300, 3600, 28800, 86400, 604800, 2592000]; // s
 const STEPS = [0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400]; // s of a bucket
 const AXES = 2; // units with an axis of their own
 
@@ -70,8 +71,8 @@ function move(by, factor = 1) {
   zoom([middle - half, middle + half]);
 }
 
-byId("spans").append(...Object.entries(SPANS).map(([text, value]) =>
-  h("button", { type: "button", value, onclick: () => choose({ span: value, from: "", to: "" }) }, text)));
+byId("spans").append(...SPANS.map((value) =>
+  h("button", { type: "button", value, onclick: () => choose({ span: value, from: "", to: "" }) }, length(value))));
 const MOVES = { earlier: [-0.5], later: [0.5], closer: [0, 0.5], wider: [0, 2] };
 for (const [id, how] of Object.entries(MOVES)) byId(id).addEventListener("click", () => move(...how));
 byId("chart").addEventListener("keydown", (event) => {
@@ -114,7 +115,7 @@ function showPens() {
     put(pen.about, tag.meta.description);
     pen.title = title(tag);
     if (tag.meta.write) pen.actions.append(writeButton(key));
-    pen.actions.append(h("button", { type: "button", className: "quiet", "aria-label": `remove ${key}`, onclick: () => choose({ tags: keys.filter((one) => one !== key).join(",") }) }, "✕"));
+    pen.actions.append(h("button", { type: "button", className: "quiet", "aria-label": t("remove {key}", { key }), onclick: () => choose({ tags: keys.filter((one) => one !== key).join(",") }) }, "✕"));
   });
 }
 
@@ -136,12 +137,12 @@ async function load() {
     chart?.destroy();
     chart = null;
     byId("chart").replaceChildren();
-    return put("trend-text", "No tag is chosen: add one above, or choose Trend at a tag.");
+    return put("trend-text", t("No tag is chosen: add one above, or choose Trend at a tag."));
   }
-  if (!drawn) put("trend-text", "reading …");
+  if (!drawn) put("trend-text", t("reading …"));
   const uPlot = await loaded().catch(() => null);
   if (mine !== loading) return;
-  if (!uPlot) return put("trend-text", "The chart could not be loaded.");
+  if (!uPlot) return put("trend-text", t("The chart could not be loaded."));
   await askValues();
   const [from, to] = range();
   const points = Math.max(100, byId("chart").clientWidth / 2);
@@ -159,11 +160,11 @@ const utc = (time) => new Date(time * 1000).toISOString();
 // Returns the buckets of one tag by their time, and why there are none.
 async function past(tag, from, to, step) {
   const key = tag.key;
-  if (!tag.meta) return { tag, why: `there is no tag ${key}`, found: new Map() };
-  if (!tag.meta.history) return { tag, why: `no history is kept of ${key}: only what this page has seen`, found: seen(tag, step) };
+  if (!tag.meta) return { tag, why: t("there is no tag {key}", tag), found: new Map() };
+  if (!tag.meta.history) return { tag, why: t("no history is kept of {key}: only what this page has seen", tag), found: seen(tag, step) };
   const width = step < 1 ? `${step * 1000}ms` : `${step}s`;
   const reply = await api("history", { tag: key, time: `[${utc(from)}..${utc(to)}]`, bucket: width }).catch(() => null);
-  if (!reply?.ok) return { tag, why: reply?.found.error ?? "no connection to the gateway", found: new Map() };
+  if (!reply?.ok) return { tag, why: said(reply?.found.error) ?? t("no connection to the gateway"), found: new Map() };
   return { tag, found: new Map(reply.found.buckets.map((one) => [Math.round((Date.parse(one.time) / 1000) * 2), one])) };
 }
 
@@ -212,7 +213,7 @@ function draw(uPlot) {
     chart.setSize(size);
     chart.setData(data, false);
     chart.setScale("x", { min: from, max: to });
-    return said();
+    return caption();
   }
   chart?.destroy();
   box.replaceChildren();
@@ -229,7 +230,7 @@ function draw(uPlot) {
       ...scales.map((name, at) => ({
         ...line, scale: name, side: at ? 1 : 3, show: at < AXES, grid: { ...line.grid, show: at === 0 },
         size: narrow ? 46 : 64, ...(!narrow && name !== "bit" && { label: name.slice(2), labelSize: 22, labelFont: line.font }),
-        ...(name === "bit" && { splits: () => [0, 1], values: () => ["off", "on"] }),
+        ...(name === "bit" && { splits: () => [0, 1], values: () => [t("off"), t("on")] }),
       })),
     ],
     series: [{}, ...series.flatMap((one, at) => {
@@ -255,7 +256,7 @@ function draw(uPlot) {
   chart = new uPlot(options, data, box);
   chart.signature = signature;
   chart.setScale("x", { min: from, max: to });
-  said();
+  caption();
 }
 
 // Time without a valid value is tinted; beside several tags each has a strip of its colour.
@@ -338,27 +339,31 @@ function cursor(plot) {
     const pen = pens?.get(tag.key);
     if (!pen) continue;
     const one = idx === null || idx === undefined ? null : found.get(Math.round(plot.data[0][idx] * 2));
-    put(pen.at, idx === null || idx === undefined ? "" : `at the cursor: ${told(tag, one)}`);
+    put(pen.at, idx === null || idx === undefined ? "" : t("at the cursor: {value}", { value: told(tag, one) }));
   }
-  said(idx);
+  caption(idx);
 }
 
 function told(tag, one) {
-  if (!one || one.quality === "bad" || one.last === null) return `no value${one?.reason ? `: ${one.reason}` : ""}`;
+  if (!one || one.quality === "bad" || one.last === null) return `${t("no value")}${one?.reason ? `: ${said(one.reason)}` : ""}`;
   const text = (value) => (tag.meta.enum?.[value] ?? written(tag, String(value)));
   if (typeof one.last !== "number" || tag.meta.enum || one.min === one.max) return text(one.last);
-  return `${text(one.mean)}, from ${text(one.min)} to ${text(one.max)}`;
+  return t("{mean}, from {min} to {max}", { mean: text(one.mean), min: text(one.min), max: text(one.max) });
 }
 
-function said(idx = null) {
-  if (idx !== null && idx !== undefined) return put("trend-text", `${new Date(chart.data[0][idx] * 1000).toLocaleString([], { hour12: false })}, ${length(drawn.step)}`);
+function caption(idx = null) {
+  if (idx !== null && idx !== undefined) return put("trend-text", `${new Date(chart.data[0][idx] * 1000).toLocaleString(dates, { hour12: false })}, ${length(drawn.step)}`);
   const why = drawn.series.map((one) => one.why).filter(Boolean);
   const [from, to] = range();
-  const at = (time) => (to - from > 86400 ? new Date(time * 1000).toLocaleString([], { hour12: false }) : clock(time * 1000));
-  put("trend-text", [`${at(from)} to ${at(to)}${fixed ? "" : " (now)"}, each point ${length(drawn.step)}`, ...why].join(". "));
+  const at = (time) => (to - from > 86400 ? new Date(time * 1000).toLocaleString(dates, { hour12: false }) : clock(time * 1000));
+  put("trend-text", [`${t("{from} to {to}", { from: at(from), to: at(to) })}${fixed ? "" : ` ${t("(now)")}`}${t(", ")}${t("each point {span}", { span: length(drawn.step) })}`, ...why].join(". "));
 }
 
-const length = (step) => (step >= 86400 ? `${step / 86400} d` : step >= 3600 ? `${step / 3600} h` : step >= 60 ? `${step / 60} min` : `${step} s`);
+function length(step) {
+  if (step < 60) return t("{n} s", { n: step });
+  if (step < 3600) return t("{n} min", { n: step / 60 });
+  return step < 86400 ? t("{n} h", { n: step / 3600 }) : t("{n} d", { n: step / 86400 });
+}
 
 const open = () => !byId("view-trend").hidden;
 on("tick", () => {

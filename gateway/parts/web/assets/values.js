@@ -1,6 +1,7 @@
 // Tags with their last values: how they are written, how old they are, their sparklines.
 
 import { h, svg, put, style, span } from "./dom.js";
+import { said, t } from "./language.js";
 import { now } from "./stream.js";
 
 const TRAIL = 15 * 60e3; // ms of a sparkline
@@ -37,8 +38,8 @@ function decimals(meta) {
 // A number has the same decimals always, so that a column does not jump.
 export function written(tag, text) {
   const { meta } = tag;
-  if (text === "true") return "on";
-  if (text === "false") return "off";
+  if (text === "true") return t("on");
+  if (text === "false") return t("off");
   if (text.startsWith("[") && meta?.length) {
     const list = text.replaceAll(",", ", ");
     return list.length > LONGEST_LIST ? `${list.slice(0, list.lastIndexOf(",", LONGEST_LIST) + 1)} …` : list;
@@ -61,12 +62,15 @@ export function shown(tag) {
   return [last.name ?? written(tag, last.text), last.name ? "" : (meta?.unit ?? ""), last.name ? `${last.name} (${last.text})` : hex];
 }
 
-const quality = ({ last }) => (!last ? "" : last.good ? last.why || "good" : `${last.quality}: ${last.why.split(": ")[0]}`);
+// The code of the reason and its sentence, or where the value is from.
+export const reasons = (why) => why.replace(/^(\S+) ?(.*)$/s, (_, code, rest) => `${said(code)} ${said(rest)}`).trim();
+
+const quality = ({ last }) => (!last ? "" : last.good ? reasons(last.why) || t("good") : `${said(last.quality)}: ${reasons(last.why).split(/: |：/)[0]}`);
 
 export const age = ({ last }) => (last && now() ? span(Math.max(0, (now() - last.time) / 1000)) : "");
 
 export const title = ({ meta }) =>
-  meta ? [meta.tag, meta.description, `${meta.type} at ${meta.address}`, `read every ${span(meta.every)}`].filter(Boolean).join("\n") : "";
+  meta ? [meta.tag, meta.description, t("{type} at {address}", meta), t("read every {span}", { span: span(meta.every) })].filter(Boolean).join("\n") : "";
 
 // `last`: text ("" if there is no value), quality, time, why, name.
 export function take(tag, last) {
@@ -92,7 +96,7 @@ export function notCurrent() {
   for (const tag of known.values()) tag.current = false;
 }
 
-const LEVELS = { high_high: "▲▲", high: "▲", low: "▼", low_low: "▼▼", on: "alarm when on", off: "alarm when off" };
+const LEVELS = { high_high: "▲▲", high: "▲", low: "▼", low_low: "▼▼", on: t("alarm when on"), off: t("alarm when off") };
 
 export function limits({ meta }) {
   if (!meta?.alarm) return "";
@@ -145,8 +149,8 @@ export function showParts(parts, tag, live) {
   put(parts.unit, unit);
   if (parts.value.title !== tip) parts.value.title = tip;
   const good = tag.last?.good;
-  parts.quality.title = good === false ? tag.last.why : "";
-  put(parts.quality, !tag.last ? "" : live ? quality(tag) : "not live");
+  parts.quality.title = good === false ? reasons(tag.last.why) : "";
+  put(parts.quality, !tag.last ? "" : live ? quality(tag) : t("not live"));
   style(parts.quality, `quality ${!live || !tag.last ? "" : good ? "good" : "bad"}`);
   put(parts.age, age(tag));
 }

@@ -1,12 +1,14 @@
 // The strip chart of one line: which device used the wire in the last seconds, and what failed.
 
 import { byId, h, put } from "./dom.js";
+import { said, t } from "./language.js";
 import { follow, now, on } from "./stream.js";
 import { devices } from "./lines.js";
 
 const WINDOW = 10000; // ms
 const MOST_ROWS = 24;
 const LISTED = 15; // exchanges below the chart
+const LEGEND = { read: t("read"), write: t("write"), probe: t("probe"), wait: t("wait for a late reply"), failed: t("failed ×") };
 const KINDS = { read: "read", write: "write", probe: "probe" };
 
 let shown = null; // { line, place, button, and the elements }
@@ -17,11 +19,11 @@ export function wireOf(line, place, button) {
   const was = shown?.line;
   close();
   if (was === line) return;
-  const canvas = h("canvas", { role: "img", "aria-label": `strip chart of ${line}` });
+  const canvas = h("canvas", { role: "img", "aria-label": t("strip chart of {line}", { line }) });
   const list = h("ul", { className: "exchanges" });
   const sum = h("p", { className: "soft wire-sum" });
-  const legend = h("p", { className: "legend", "aria-hidden": "true" }, ...["read", "write", "probe", "wait for a late reply", "failed ×"].map((text) => h("span", { className: text.split(" ")[0] }, text)));
-  place.replaceChildren(canvas, legend, sum, h("details", {}, h("summary", {}, "Last exchanges, decoded"), list));
+  const legend = h("p", { className: "legend", "aria-hidden": "true" }, ...Object.entries(LEGEND).map(([kind, text]) => h("span", { className: kind }, text)));
+  place.replaceChildren(canvas, legend, sum, h("details", {}, h("summary", {}, t("Last exchanges, decoded")), list));
   button.setAttribute("aria-pressed", "true");
   shown = { line, place, button, canvas, list, sum };
   follow({ line });
@@ -50,7 +52,7 @@ on("wire", (found) => {
   shown?.list.replaceChildren(...exchanges.slice(-LISTED).reverse().map((one) => h("li", {},
     h("span", { className: "age" }, new Date(one.begun).toISOString().slice(11, 23)), h("b", {}, one.device), h("span", {}, one.what),
     h("span", { className: "age" }, `${(one.took * 1000).toFixed(0)} ms`),
-    h("span", { className: one.failed ? "wrong" : "soft" }, one.failed ? `failed: ${one.result}` : one.result))));
+    h("span", { className: one.failed ? "wrong" : "soft" }, one.failed ? t("failed: {why}", { why: said(one.result) }) : said(one.result)))));
 });
 
 on("time", () => shown && draw());
@@ -64,7 +66,7 @@ function draw() {
   const rows = names.length > MOST_ROWS ? names.filter((name) => of(name).length).slice(0, MOST_ROWS) : names;
   const failed = seen.filter((one) => one.failed).length;
   const busy = seen.reduce((all, one) => all + one.took, 0);
-  put(sum, `${seen.length} exchanges in 10 s, ${failed} failed, in use ${Math.min(100, Math.round((100 * busy * 1000) / WINDOW))} % of the time${missed ? `; ${missed} are not shown` : ""}`);
+  put(sum, [t("{n} exchanges in 10 s, {failed} failed, in use {share} % of the time", { n: seen.length, failed, share: Math.min(100, Math.round((100 * busy * 1000) / WINDOW)) }), missed && t("{n} are not shown", { n: missed })].filter(Boolean).join("; "));
   const [width, row] = [canvas.clientWidth, 24];
   const left = Math.min(160, width / 3);
   const height = row * Math.max(1, rows.length) + 22;
@@ -87,7 +89,7 @@ function draw() {
     pen.fillRect(Math.min(at, width - 1), 0, 1, height - 20);
     pen.fillStyle = color("soft");
     pen.textAlign = second === 10 ? "right" : "center";
-    pen.fillText(second === 10 ? "now" : `${second - 10} s`, at, height - 4);
+    pen.fillText(second === 10 ? t("now") : t("{n} s", { n: second - 10 }), at, height - 4);
   }
   rows.forEach((name, number) => {
     const top = number * row;

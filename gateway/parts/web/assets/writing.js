@@ -1,6 +1,7 @@
 // Writing a tag where it is shown: unit, limits, present value, and a second step before it is sent.
 
 import { h, put } from "./dom.js";
+import { listed, said, t } from "./language.js";
 import { gateway, post, signedIn } from "./stream.js";
 import { shown, tagOf } from "./values.js";
 
@@ -8,7 +9,7 @@ let open = null; // the editor
 
 // Hidden by the class `read-only` of the page where nothing can be written.
 export function writeButton(key) {
-  return h("button", { type: "button", className: "quiet write", "aria-label": `write ${key}`, onclick: (event) => edit(key, event.currentTarget) }, "Write");
+  return h("button", { type: "button", className: "quiet write", "aria-label": t("write {key}", { key }), onclick: (event) => edit(key, event.currentTarget) }, t("Write"));
 }
 
 async function edit(key, button) {
@@ -17,33 +18,33 @@ async function edit(key, button) {
   if (was === button || !(await signedIn())) return;
   const tag = tagOf(key);
   const input = field(tag.meta);
-  const send = h("button", { type: "submit", className: "main" }, "Write …");
+  const send = h("button", { type: "submit", className: "main" }, t("Write …"));
   const result = h("p", { className: "result", role: "alert" });
   const present = h("b");
-  const editor = h("form", { className: "editor", "aria-label": `write ${key}` },
-    h("p", {}, key, ", now ", present),
-    h("label", {}, h("span", { className: "hidden" }, "New value"), input, " ", tag.meta.unit),
+  const editor = h("form", { className: "editor", "aria-label": t("write {key}", { key }) },
+    h("p", {}, t("{key}, now", { key }), " ", present),
+    h("label", {}, h("span", { className: "hidden" }, t("New value")), input, " ", tag.meta.unit),
     h("span", { className: "soft" }, allowed(tag.meta)),
-    h("span", { className: "bar" }, send, h("button", { type: "button", onclick: close }, "Close")),
+    h("span", { className: "bar" }, send, h("button", { type: "button", onclick: close }, t("Close"))),
     result);
   const disarm = () => {
     editor.armed = false;
-    put(send, "Write …");
+    put(send, t("Write …"));
   };
   input.addEventListener("input", disarm);
   editor.addEventListener("keydown", (event) => event.key === "Escape" && close());
   editor.addEventListener("submit", async (event) => {
     event.preventDefault();
     const text = input.value.trim();
-    if (!gateway.live) return put(result, "Not live: nothing was sent.");
+    if (!gateway.live) return put(result, t("Not live: nothing was sent."));
     if (!editor.armed) {
       editor.armed = true;
       put(result, "");
-      return put(send, `Confirm: ${text} ${tag.meta.unit}`.trim());
+      return put(send, t("Confirm: {value}", { value: `${text} ${tag.meta.unit}`.trim() }));
     }
     disarm();
     send.disabled = true;
-    put(result, "writing …");
+    put(result, t("writing …"));
     put(result, await write(key, text, tag.meta));
     send.disabled = false;
   });
@@ -67,25 +68,25 @@ function close() {
 export const isEdited = (row) => open !== null && row.contains(open.editor);
 
 function field(meta) {
-  const names = meta.type === "bool" ? { true: "on", false: "off" } : meta.enum;
+  const names = meta.type === "bool" ? { true: t("on"), false: t("off") } : meta.enum;
   if (!names || meta.length) return h("input", { required: true, autocomplete: "off", inputMode: meta.type === "string" ? "text" : "decimal" });
   return h("select", {}, ...Object.entries(names).map(([value, name]) => h("option", { value }, name)));
 }
 
 function allowed({ write, length, unit }) {
   const { min, max, verify } = write;
-  const ends = [min !== null && `at least ${min} ${unit}`.trim(), max !== null && `at most ${max} ${unit}`.trim(), length && `${length} values, as [1, 2]`, verify && "read back"];
-  return ends.filter(Boolean).join(", ");
+  const ends = [min !== null && t("at least {n}", { n: `${min} ${unit}`.trim() }), max !== null && t("at most {n}", { n: `${max} ${unit}`.trim() }), length && t("{n} values, as [1, 2]", { n: length }), verify && t("read back")];
+  return listed(ends);
 }
 
 async function write(tag, text, meta) {
   try {
     const { ok, found } = await post("write", { tag }, meta.length ? text : asJson(text));
-    if (!ok) return `Not done: ${found.error}${found.reason ? `: ${found.reason}` : ""}`;
-    const done = !found.acknowledged ? "sent to all, which no device acknowledges" : found.verified ? "acknowledged and read back" : "acknowledged";
-    return `${`${found.value} ${meta.unit}`.trim()}: ${done}${found.note ? `. ${found.note}` : ""}`;
+    if (!ok) return t("Not done: {why}", { why: [found.error, found.reason].filter(Boolean).map(said).join(": ") });
+    const done = !found.acknowledged ? t("sent to all, which no device acknowledges") : found.verified ? t("acknowledged and read back") : t("acknowledged by the device");
+    return `${`${found.value} ${meta.unit}`.trim()}: ${done}${found.note ? `. ${said(found.note)}` : ""}`;
   } catch {
-    return "The connection ended; it is not known whether the value was written.";
+    return t("The connection ended; it is not known whether the value was written.");
   }
 }
 
