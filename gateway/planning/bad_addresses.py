@@ -80,6 +80,13 @@ class _Node:
             return {(self.span.area, self.halves[1].span.start)}
         return set().union(*(half.splits() for half in self.halves))
 
+    def failed_twice(self) -> set[Cut]:
+        """Returns the boundaries between the halves of failed blocks, where a half failed too."""
+        if not any(half.halves or half.good is False for half in self.halves):
+            return set()
+        inside = (half.failed_twice() for half in self.halves)
+        return {(self.span.area, self.halves[1].span.start)}.union(*inside)
+
 
 def within(inner: Span, outer: Span) -> bool:
     """Returns True if the outer span has all addresses of the inner one."""
@@ -212,7 +219,11 @@ class BadAddresses:
         return True
 
     def abandon(self) -> None:
-        """Drops the searches: the device gets other blocks, and a bad address is found again."""
+        """Drops the searches: the device gets other blocks, and a bad address is found again.
+
+        The next search goes on in the halves that failed too, or it would never end on a line that
+        is often interrupted."""
+        self.splits |= self._open_splits()
         self.searches.clear()
         self._leaves.clear()
         self._look()
@@ -221,9 +232,13 @@ class BadAddresses:
         kept = self.bad or self.searches or self.splits or self._suspected
         self.clear = not (kept or self.silenced)
 
+    def _open_splits(self) -> set[Cut]:
+        open_ones = (root for root in self.searches if not root.settled())
+        return set().union(*(root.failed_twice() for root in open_ones))
+
     def known(self) -> KnownBad:
         refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())
-        return KnownBad(tuple(sorted(refused)), tuple(sorted(self.cuts)))
+        return KnownBad(tuple(sorted(refused)), tuple(sorted(self.cuts | self._open_splits())))
 
     def restore(self, known: KnownBad, tags: Iterable[Tag]) -> None:
         """Takes over the result of an earlier run. Skips ranges that the tags no longer fill."""

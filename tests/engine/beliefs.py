@@ -97,7 +97,7 @@ BELIEFS = (
     ),
     Belief(
         "refuses monitor lists",
-        "it refused its list twice",
+        "it refused its list twice, or was silent about it",
         "time: it is tried again",
         "the list is registered again",
         LIST_REFUSED_FOR,

@@ -341,6 +341,28 @@ def test_an_unclear_end_forgets_the_monitor_list() -> None:
     assert rig.device.monitor.registered == ()
 
 
+def test_a_plc_that_is_silent_about_its_list_is_read_without_one() -> None:
+    """Each registration cost a time-out, for ever: only a refusal ended it."""
+    driver = ComputerLink(station=1, monitor=True)
+    timing = replace(driver.timing, retries=1)
+    tags = [make_tag(f"D{n}", driver) for n in range(0, 400, 100)]
+    rig = Rig(made_device("plc", driver, WIRE, timing, tags))
+    rig.bring(State.ONLINE)
+    for _ in range(20):
+        match job := rig.transacted():
+            case Poll() if rig.entry(job).block.listed:
+                rig.fail(job)
+            case Poll():
+                rig.conclude(job, [0] * job.span.size)
+            case _:
+                rig.conclude(job, Resynced(1))
+    assert not any(block.listed for block in rig.device.blocks)
+    assert events(rig).count("monitor list refused") == 1
+    renewed = rig.device.successor(rig.device.settings, rig.device.bad_addresses.known())
+    renewed.plan()
+    assert not any(block.listed for block in renewed.blocks)
+
+
 def test_the_line_waits_for_late_replies_of_online_devices_alone() -> None:
     rig = Rig()
     guards = list[float]()

@@ -152,6 +152,25 @@ def test_splits_found_after_a_new_try_of_the_whole_block_are_kept_until_the_next
     assert bad.cuts == {("D", 8)}
 
 
+def test_an_interrupted_search_goes_on_in_the_halves_that_failed_too() -> None:
+    """Reloads and devices that went offline began it again with the whole block, for ever."""
+    found = words(*range(16))
+    (whole,), bad = found.blocks, found.bad_addresses
+    first, second = bad.refused(whole, 0, SILENT)
+    assert bad.known().cuts == ()  # one failure may be noise
+    bad.read(first)
+    bad.refused(second, 0, SILENT)
+    assert bad.known().cuts == (("D", 8),)
+    bad.abandon()
+    found.plan()
+    assert [block.span for block in found.blocks] == [Span("D", 0, 8), Span("D", 8, 8)]
+    asker = Asker(found, {9})
+    asker.settle()
+    assert bad_numbers(found) == {9}
+    assert not bad.rejoin(0.0)
+    assert bad.rejoin(SPLIT_FIRST)
+
+
 def test_a_bad_address_in_a_faster_block_is_cut_off() -> None:
     """Its boundaries lie in a gap of the faster tags: they must be kept there too."""
     fast = [make_tag(f"D{n}", every=0.1) for n in (0, 1, 8, 9)]

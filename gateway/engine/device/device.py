@@ -164,6 +164,8 @@ class Device:
         may do it; `take_over` gives it everything else that was learned. `bad`: addresses."""
         new = Device(settings, self.wire, plan_now=False)
         new.bad_addresses.restore(bad, settings.wire_tags)
+        if not self.monitor.allowed:
+            new.monitor.forbid(self.monitor.again)
         if settings.turnaround == self.settings.turnaround:
             new.turnaround = self.turnaround
         return new

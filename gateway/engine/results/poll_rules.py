@@ -126,7 +126,10 @@ class PollRules:
             self._schedule.again(poll, now + BUSY_PAUSE * 2**poll.tries)
             return
         if block.listed:
-            self._list_refused(poll, error, now)
+            if poll.tries < 1:
+                self._schedule.again(poll)
+            else:
+                self._plan_without_list(device, error, now)
             return
         lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)
         if lasting and block.span not in device.bad_addresses.bad:
@@ -173,12 +176,8 @@ class PollRules:
         log("address refused", device=device.name, block=describe(block), why=str(error))
         return False
 
-    def _list_refused(self, poll: PollEntry, error: Refused, now: float) -> None:
-        """Registers the monitor list again, or plans without one: it may have a bad address."""
-        if poll.tries < 1:
-            self._schedule.again(poll)
-            return
-        device = poll.device
+    def _plan_without_list(self, device: Device, error: DeviceError, now: float) -> None:
+        """Reads the device without a monitor list for an hour: it may have a bad address."""
         self._effects.warning("monitor list refused", device=device.name, why=str(error))
         device.monitor.refused(now)
         device.bad_addresses.abandon()
@@ -234,6 +233,9 @@ class PollRules:
         lasting = others_answered and (known or half or poll.missed > 0)
         of_others = isinstance(error, Garbled) and error.evidence in OF_OTHERS
         code = DAMAGED if isinstance(error, Garbled) else SILENT
+        if lasting and poll.block.listed and code == SILENT:
+            self._plan_without_list(poll.device, error, now)
+            return
         if lasting and not of_others and self._halved(poll, error, code, now, time):
             return
         self._end_badly(poll, health.reason, error, now, time, answered=False)
