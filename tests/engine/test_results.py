@@ -348,7 +348,7 @@ def test_a_plc_that_is_silent_about_its_list_is_read_without_one() -> None:
     tags = [make_tag(f"D{n}", driver) for n in range(0, 400, 100)]
     rig = Rig(made_device("plc", driver, WIRE, timing, tags))
     rig.bring(State.ONLINE)
-    for _ in range(20):
+    for _ in range(60):
         match job := rig.transacted():
             case Poll() if rig.entry(job).block.listed:
                 rig.fail(job)

@@ -28,6 +28,7 @@ from gateway.tags import Reason
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 # They say nothing of addresses.
 OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.SLOW, Evidence.ECHO)
+LIST_MISSED = 3  # rounds without a reply to the monitor list alone, until it is given up
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
@@ -126,10 +127,7 @@ class PollRules:
             self._schedule.again(poll, now + BUSY_PAUSE * 2**poll.tries)
             return
         if block.listed:
-            if poll.tries < 1:
-                self._schedule.again(poll)
-            else:
-                self._plan_without_list(device, error, now)
+            self._list_refused(poll, error, now)
             return
         lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)
         if lasting and block.span not in device.bad_addresses.bad:
@@ -175,6 +173,13 @@ class PollRules:
         log = self._effects.debug if known else self._effects.warning
         log("address refused", device=device.name, block=describe(block), why=str(error))
         return False
+
+    def _list_refused(self, poll: PollEntry, error: Refused, now: float) -> None:
+        """Registers the monitor list again, or plans without one."""
+        if poll.tries < 1:
+            self._schedule.again(poll)
+        else:
+            self._plan_without_list(poll.device, error, now)
 
     def _plan_without_list(self, device: Device, error: DeviceError, now: float) -> None:
         """Reads the device without a monitor list for an hour: it may have a bad address."""
@@ -233,7 +238,7 @@ class PollRules:
         lasting = others_answered and (known or half or poll.missed > 0)
         of_others = isinstance(error, Garbled) and error.evidence in OF_OTHERS
         code = DAMAGED if isinstance(error, Garbled) else SILENT
-        if lasting and poll.block.listed and code == SILENT:
+        if lasting and poll.block.listed and code == SILENT and poll.missed >= LIST_MISSED:
             self._plan_without_list(poll.device, error, now)
             return
         if lasting and not of_others and self._halved(poll, error, code, now, time):
