@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from gateway.engine.device.device import ECHO_PROVEN_FOR
+from gateway.engine.device.device import ECHO_PROVEN_FOR, SECONDS
 from gateway.engine.device.health import FORGOTTEN
 from gateway.engine.device.identity import SILENT_FOR
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
@@ -163,6 +163,13 @@ BELIEFS = (
         "a refusal of this resync",
         "ten minutes",
         "one such resync proves several reads",
+        WARY_FOR,
+    ),
+    Belief(
+        "the device is silent about second requests of resyncs",
+        f"{SECONDS} of them without a reply, and no late reply for a minute",
+        "ten minutes",
+        "their replies have a form that was not requested for long",
         WARY_FOR,
     ),
     Belief(

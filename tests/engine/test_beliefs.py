@@ -350,6 +350,12 @@ def no_form_of_its_own() -> Way:
     return lambda after: pace.lacked_until <= HOUR + after
 
 
+def silent_about_seconds() -> Way:
+    pace = ProofPace()
+    pace.lacks_seconds(HOUR)
+    return lambda after: pace.seconds_from <= HOUR + after
+
+
 def as_quick_as_before() -> Way:
     health, now = link_device().health, HOUR
     health.unclear(SILENCE, None, now)
@@ -387,6 +393,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "a device that is never read does not answer": never_read,
     "noise destroys its replies": noise,
     "the device lacks a read with a form of its own": no_form_of_its_own,
+    "the device is silent about second requests of resyncs": silent_about_seconds,
     "a device that returns is as quick as before": as_quick_as_before,
     "earlier requests are kept": kept_requests,
 }

@@ -212,7 +212,8 @@ class Nowhere:
 class World:
     """A wire with faults, two programs, and one gateway after another."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, only: Sequence[str] = ()) -> None:
+        self._only = only  # kinds of faults; empty: all
         self.draw, self.found = random.Random(seed), Counter[str]()
         self.wrong: list[str] = []
         self.freezer = Freezer()
@@ -290,7 +291,7 @@ class World:
             "doubts": partial(setattr, self, "doubted", now()),
             "standby": self.ends.set,
         }
-        fault = self.draw.choice([*begin])
+        fault = self.draw.choice([one for one in begin if one in (self._only or begin)])
         begin[fault]()
         self.count(fault)
         await asyncio.sleep(self.draw.choice(HOLDS if fault == "held" else LENGTHS))
@@ -425,13 +426,13 @@ class _Over(Exception):
     """The gateway is no longer the active one: its programs and requests end with it."""
 
 
-def run(seed: int, seconds: float) -> World:
-    """Returns the world after so many seconds of its time."""
+def run(seed: int, seconds: float, only: Sequence[str] = ()) -> World:
+    """Returns the world after so many seconds of its time. `only`: kinds of faults."""
     worlds: list[World] = []
 
     @on_virtual_time
     async def story() -> None:
-        worlds.append(World(seed))
+        worlds.append(World(seed, only))
         await worlds[0].run(seconds)
 
     story()
@@ -442,5 +443,5 @@ def story(
     seed: int, hours: float, pace: str, only: Sequence[str] = (), *, traced: bool = True
 ) -> Story:
     """Runs a seed for `make sim PACE=doors`."""
-    world = run(seed, hours * 3600)
+    world = run(seed, hours * 3600, only)
     return Story(seed, hours, pace, tuple(only), world.wrong, world.found)

@@ -5,7 +5,7 @@ The table `TRANSITIONS` holds every change of state. No other module assigns a f
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
@@ -73,6 +73,8 @@ class Outstanding:
     sent: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     # Their spans, but those of resyncs; None: a request that may have had any shape.
     spans: set[Span | None] = field(default_factory=set)
+    # The shapes of second requests of resyncs.
+    seconds: deque[Hashable] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     either: int = 0  # of any shape: the reply to the request, or to the resync that went with it
 
     def add(self, span: Span | None, now: float) -> None:
@@ -83,6 +85,7 @@ class Outstanding:
     def clear(self) -> None:
         self.sent.clear()
         self.spans.clear()
+        self.seconds.clear()
         self.either = 0
 
 

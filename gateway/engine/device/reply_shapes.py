@@ -23,6 +23,7 @@ WARY = 1.5  # the same after an extra reply: others may be as late
 WARY_FOR = 600.0  # seconds
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
+INSIDE = 64  # units of a read inside a block, at most
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
 
@@ -64,6 +65,9 @@ class ProofPace:
     most: int = 1
     lacked_until: float = -NEVER  # until then it has no read with a form of its own: refused
 
+    # Until then it is silent about the reads that the second request of a resync may have.
+    seconds_from: float = -NEVER
+
     def ended(self, *, proven: bool) -> None:
         """Notes the end of reads that waited for one resync."""
         self.most = min(2 * self.most, MOST_HELD) if proven else 1
@@ -71,6 +75,10 @@ class ProofPace:
     def lacks(self, now: float) -> None:
         """Notes that the device refused the read with a form of its own."""
         self.lacked_until = now + WARY_FOR
+
+    def lacks_seconds(self, now: float) -> None:
+        """Notes that the device was silent about second requests, although it is not late."""
+        self.seconds_from = now + WARY_FOR
 
 
 class ReplyShapes:
@@ -156,9 +164,23 @@ class ReplyShapes:
         self._used[shape] = now
         self._sent(shape, now)
 
+    def also_sent(self, shape: Hashable, now: float) -> None:
+        """Notes a read that belongs to another request: a resync, or what a peek reads."""
+        self._used[shape] = now
+
+    def used_at(self, shape: Hashable) -> float:
+        """Returns the time of the last request whose reply has the shape, but writes."""
+        return self._used.get(shape, -NEVER)
+
     def of(self, span: Span) -> Hashable:
         """Returns the shape of the reply to a read of the span."""
         return self.longer.driver.reply_shape(span)
+
+    def inside(self, spans: Sequence[Span], outstanding: Span | None) -> set[Hashable]:
+        """Returns the shapes of reads inside the spans, but that of the outstanding one."""
+        sizes = ((span, size) for span in spans for size in range(1, min(span.size, INSIDE) + 1))
+        found = {self.of(Span(span.area, span.start, size)) for span, size in sizes}
+        return found - {None, outstanding and self.of(outstanding)}
 
     def probed(
         self, outstanding: Span | None, token: int, spans: Sequence[Span], now: float

@@ -154,11 +154,15 @@ class RequestQueue:
 
 def _resync_around(job: Write | WriteTogether | Command, shapes: ReplyShapes, now: float) -> None:
     """Notes the request, and adds the resyncs that it needs."""
-    token = job.device.health.next_probe_token
+    device = job.device
+    token = device.health.next_probe_token
     if isinstance(job, Command):
         if not job.broadcast and shapes.may_be_extra(None, now):
             job.resync(token())
         shapes.sent(None, now)
+        if job.span is not None:
+            shapes.also_sent(shapes.of(job.span), now)
+        _note_resyncs(device, None, job.resyncs, now)
         return
     write = job if isinstance(job, Write) else job.writes[0]
     span, units, reads = write.tag.span, write.units, write.part is not None
@@ -169,3 +173,11 @@ def _resync_around(job: Write | WriteTogether | Command, shapes: ReplyShapes, no
     write.resyncs = Resyncs(token() if before else None, token() if after else None)
     if (long := write.long) is not None and not shapes.tells_apart(long, units):
         long.resync_each([token() for _ in long.spans])
+    if before or after:
+        _note_resyncs(device, span if write.tag.polled else None, write.resyncs, now)
+
+
+def _note_resyncs(device: Device, near: Span | None, resyncs: Resyncs, now: float) -> None:
+    for token in resyncs:
+        if token is not None:
+            device.note_resync(near, token, now)

@@ -107,7 +107,7 @@ class NextJob:
         """Applies the result of a job that is no poll."""
         match job:
             case Settle():
-                self._settled(job, result, now, time)
+                self._settled(job, result, traffic, now, time)
             case Probe():
                 self._probed(job, result, traffic, now, time)
             case Identify():
@@ -128,14 +128,13 @@ class NextJob:
             case (
                 Resynced() | Refused()
             ):  # an error reply counts too, but may belong to an older request
-                told_from = result.told_from if isinstance(result, Resynced) else 0
+                told_from = _told_from(probe, result)
                 if outstanding := self._results.outstanding_requests(device):
                     outstanding += device.health.unanswered.either
                 inherited = told_from < EVERY_REQUEST and (self.inherits or device.health.inherits)
                 if not probe.again and (outstanding > told_from or inherited):
                     if told_from and not inherited and device.may_be_proven(now):
-                        proof = Probe(device, probe.outstanding, PROOF, timeout=probe.timeout)
-                        self._in_flight.follow(proof)
+                        self._prove(probe, now)
                         return
                     # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
@@ -151,8 +150,15 @@ class NextJob:
                 self.unclear(probe, result, traffic, now, time)
             case LineDown():  # its reply may still arrive, on the next connection
                 device.health.left_outstanding(None, now)
+                _leave_second(probe, now)
             case BadValue():
                 raise result
+
+    def _prove(self, probe: Probe, now: float) -> None:
+        """Lets a read follow whose reply has a form that no unanswered request has."""
+        proof = Probe(probe.device, probe.outstanding, PROOF, timeout=probe.timeout)
+        probe.device.note_resync(proof.outstanding, PROOF, now)
+        self._in_flight.follow(proof)
 
     def _identified(
         self, job: Identify, result: Result, traffic: Traffic, now: float, time: int
@@ -181,6 +187,8 @@ class NextJob:
         device = job.device
         self.proofs.release(now, time, proven=False)
         asked, (known, resynced) = span_of(job), may_be_told(job)
+        if isinstance(job, Probe):
+            _leave_second(job, now)
         before = self._results.unclear(
             device, error, asked, now, time, known=known, resynced=resynced
         )
@@ -205,9 +213,13 @@ class NextJob:
         polled = isinstance(error, NoReply) and isinstance(job, Poll | Probe)
         return polled and job.device.shapes is not None and self._results.is_noisy(job.device, now)
 
-    def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
+    def _settled(
+        self, settle: Settle, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
         device, after = settle.device, settle.after
         if settle.error is None:
+            if traffic.heard:
+                device.health.probes.replied_late(now)
             if isinstance(after, Poll):
                 self.proofs.release(now, time, proven=isinstance(result, Settled) and result.quiet)
             elif isinstance(result, Settled) and not result.quiet:
@@ -215,7 +227,8 @@ class NextJob:
                 device.health.inherit(inherits=False)
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
-                again = Probe(device, after.outstanding, after.token + 1, again=True)
+                token = device.second_token(after.outstanding, after.token + 1, now)
+                again = Probe(device, after.outstanding, token, again=True)
                 self._in_flight.follow(again)
             return
         short = _is_short(after)
@@ -244,6 +257,19 @@ class NextJob:
         self._in_flight.clear()
         if job is not None:
             self._requests.abandon(job, error, now)
+
+
+def _told_from(probe: Probe, result: Resynced | Refused) -> int:
+    """Returns the number of unanswered requests from which the reply is told."""
+    if isinstance(result, Refused) or probe.device.is_like_a_second(probe.outstanding, probe.token):
+        return 0
+    return result.told_from
+
+
+def _leave_second(probe: Probe, now: float) -> None:
+    """Notes that the second request of a resync has no reply."""
+    if probe.again and probe.token != PROOF:
+        probe.device.leave_second(probe.outstanding, probe.token, now)
 
 
 def _is_suspect(poll: Poll) -> bool:
