@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench scenarios peers plant reloads pictures pins crowd bridges parsers contract docs clean sbom release bundle
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator bench scenarios peers plant reloads pictures pins crowd bridges archive parsers contract docs clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -141,6 +141,7 @@ SEEDS ?= 0-19
 HOURS ?= 1
 PACE ?= busy
 EXAMPLES ?= 20000
+KILLS ?= 200
 MINUTES ?= 30
 SAMPLE ?= 50
 SEED ?= 0
@@ -174,6 +175,10 @@ histories: .venv/ready
 # Bridges, brokers and gateways killed at random; what their clients show (docs/contributors/bridges.md).
 bridges: .venv/ready
 	$(BIN)/python -m tests.bridges.campaign --hours $(HOURS) --seed $(SEED)
+
+# Archivers, databases and gateways killed at random; what the archive has then (docs/archive.md).
+archive: .venv/ready
+	$(BIN)/python -m tests.archive.campaign --kills $(KILLS) --seed $(SEED)
 
 # 10,000 connections to the page of a gateway that runs.
 crowd: .venv/ready

@@ -38,6 +38,11 @@ def described_by(key: str, payload: bytes) -> Known | None:
 def parsed(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known:
     """Returns the document of a payload, also of a tag with `payload: raw`. A payload that is none
     is `garbled`."""
+    return document_of(meta, is_put, payload, about) or bad("garbled")
+
+
+def document_of(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known | None:
+    """Returns the document of a payload, None where it is none: it is from another program."""
     try:
         if not about:
             known = orjson.loads(payload)
@@ -45,9 +50,9 @@ def parsed(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known:
             is_text = meta["type"].startswith("string")
             value = payload.decode() if is_text else orjson.loads(payload or b"null")
             known = {"value": value if is_put else None, **orjson.loads(about)}
-        return known if is_value(known) else bad("garbled")
+        return known if is_value(known) else None
     except (KeyError, TypeError, ValueError):
-        return bad("garbled")  # from another program
+        return None
 
 
 def is_value(known: Any) -> bool:

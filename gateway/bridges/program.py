@@ -26,7 +26,12 @@ class Gateways(NamedTuple):
 
 
 # The extras of pyproject.toml.
-_INSTALLED_BY = {"opcua": "pip install asyncua", "mqtt": "pip install aiomqtt protobuf"}
+_INSTALLED_BY = {
+    "bridge opcua": "pip install asyncua",
+    "bridge mqtt": "pip install aiomqtt protobuf",
+    "archive in PostgreSQL": "pip install psycopg psycopg-binary",
+    "archive in Parquet": "pip install pyarrow",
+}
 
 
 def say(text: str) -> None:
@@ -35,14 +40,14 @@ def say(text: str) -> None:
 
 @contextmanager
 def packages_of(name: str) -> Iterator[None]:
-    """Imports a bridge. Raises `ConfigError` where the packages of its extra are not installed."""
+    """Imports a bridge or a store. Raises `ConfigError` where the packages of its extra lack."""
     try:
         yield
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("gateway"):
             raise
         raise ConfigError(
-            f"bridge {name} needs the package {error.name}, which is not installed: "
+            f"{name} needs the package {error.name}, which is not installed: "
             f"{_INSTALLED_BY[name]}, with the pip of the gateway"
         ) from None
 

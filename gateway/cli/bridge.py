@@ -59,7 +59,7 @@ def opcua(
     ] = None,
 ) -> None:
     """Serve values, alarms and history to OPC UA clients, and take writes from them."""
-    with packages_of("opcua"):
+    with packages_of("bridge opcua"):
         from gateway.bridges.opcua.server import Options, bridge
     writers = None if writes else frozenset(writer)
     options = Options(listen, pki, certificate, key, security, users, writers, anonymous)
@@ -99,11 +99,11 @@ def mqtt(
     if sparkplug is None:
         if node or host:
             raise ConfigError("--node and --host belong to --sparkplug")
-        with packages_of("mqtt"):
+        with packages_of("bridge mqtt"):
             from gateway.bridges.mqtt.bridge import bridge
         run(bridge(gateways, broker, root, expire, commands if writes else None))
     else:
-        with packages_of("mqtt"):
+        with packages_of("bridge mqtt"):
             from gateway.bridges.mqtt.sparkplug.bridge import bridge as sparkplug_bridge
         ids = sparkplug, node or prefix.replace("/", "-")
         run(sparkplug_bridge(gateways, broker, ids, host, writes))

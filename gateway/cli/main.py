@@ -46,6 +46,7 @@ _COMMANDS = {
     "doctor": "doctor:doctor",
     "alarms": "alarms:alarms",
     "bridge": "bridge:cli",
+    "archive": "archive.command:cli",
     "notify": "notify:notify",
     "audit": "audit:audit",
     "trace": "trace:trace",

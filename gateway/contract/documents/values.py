@@ -166,4 +166,5 @@ class PageDocument(TypedDict):
     samples: int
     complete: bool
     next: str
+    again: NotRequired[int]  # of the samples, the last: they come again in the next page
     damaged: NotRequired[str]

@@ -71,6 +71,7 @@ def end(
     last: str | Place,
     *,
     complete: bool,
+    again: int,
     lost: Damaged | None,
 ) -> bytes:
     """Returns the last document of a page; `last`: the tag or the place of its last reply."""
@@ -80,6 +81,8 @@ def end(
         "complete": complete,
         "next": f"{gateway}:{place}",
     }
+    if again:
+        document["again"] = again
     if lost is not None:
         document["damaged"] = str(lost)
     return orjson.dumps(document)

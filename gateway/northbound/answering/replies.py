@@ -182,7 +182,7 @@ class Replies:
     ) -> None:
         until = self._clock() + (ANSWER_WITHIN if page is None else PAGE_WITHIN)
         last: Place = ("", 0, 0)
-        count, lost, complete = 0, None, False
+        count, again, lost, complete = 0, 0, None, False
         for sample, place in found:
             if isinstance(sample, Damaged):
                 lost = sample
@@ -191,6 +191,7 @@ class Replies:
             elif has_value(sample) or not only_good:
                 self._recorded(query, sample)
                 count += 1
+                again += place is None
             last = place or last
             if page is None or self._ended:
                 self._go_on(until)
@@ -198,7 +199,7 @@ class Replies:
                 break
             pause()
         if page is not None:
-            self._end_page(query, count, last, complete=complete, lost=lost)
+            self._end_page(query, count, last, complete=complete, again=again, lost=lost)
         elif lost is not None:
             raise lost
 
@@ -218,9 +219,10 @@ class Replies:
         place: str | Place,
         *,
         complete: bool,
+        again: int = 0,
         lost: Damaged | None = None,
     ) -> None:
-        end = pages.end(self._keys.gateway, count, place, complete=complete, lost=lost)
+        end = pages.end(self._keys.gateway, count, place, complete=complete, again=again, lost=lost)
         self._reply(query, self._keys.page, end, self._stamp())
 
     def _failed(self, error: GatewayError, query: zenoh.Query) -> None:
@@ -229,8 +231,11 @@ class Replies:
         self.outcome(bad if is_query else payload.failure(error), query)
 
     def writes(self, now: int, query: zenoh.Query) -> None:
-        """Replies with recorded outcomes, on the key of their publication. `now` as in
-        `history`."""
+        """Replies with recorded outcomes, on the key of their publication; on the key of pages with
+        the samples of all tags. `now` as in `history`."""
+        if str(query.key_expr) == self._keys.page:
+            self.history(ParsedKey(Family.VALUE, self._keys.values), now, query)
+            return
         key = self._keys.writes
 
         def found(time_range: str, limit: int | None) -> Iterator[_Row]:

@@ -139,7 +139,11 @@ class Recent:
             return Content(
                 self.file,
                 self.sorted_runs,
-                [(run.number, run.samples, len(run.samples)) for run in self._runs],
+                [
+                    # Nothing is on disk yet: another run may get the number after a crash.
+                    (run.number if run.stored else 0, run.samples, len(run.samples))
+                    for run in self._runs
+                ],
             )
 
     def latest_before(self, time: int) -> int:

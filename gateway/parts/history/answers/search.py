@@ -111,6 +111,7 @@ class Search:
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
         place, found = (mark, begin, max(first - 1, 0)), False
+        yield from _deleted(sorted_runs, newest, place if first else None)
         for run in runs:
             skipped = first if run.number == begin else 0
             if skipped < run.samples and stored.of([run]):
@@ -230,6 +231,15 @@ def _found(
             yield n, sample
         elif n % _MANY == 0:
             pause()
+
+
+def _deleted(
+    runs: Sequence[SortedRun], newest: Sequence[tuple[int, list[Sample], int]], after: Place | None
+) -> Recorded:
+    """Yields `Damaged` if samples after the place were deleted to make room."""
+    numbers = [*(run.number for run in runs[:1]), *(number for number, _, _ in newest if number)]
+    if after is not None and numbers and (count := numbers[0] - after[1] - after[2] - 1) > 0:
+        yield Damaged(f"{count} samples were deleted before they were read"), after
 
 
 def _mark(file: Identity | None) -> str:

@@ -138,6 +138,7 @@ class Transfer:
             if not run.number:
                 run.number = file.next_number()
                 self._unsorted.append(run)
+                file.set_sync(full=True)  # no other run gets the number after a power cut
             end = min(count, run.stored + BATCH_SIZE)
             file.store(run.number + run.stored, run.samples[run.stored : end])
             self.stored += end - run.stored

@@ -1,0 +1,91 @@
+"""The `archive` commands: the histories of many gateways in one store, and how far they are."""
+
+import json
+import time
+from typing import Annotated
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from gateway.archive.archiver import archive
+from gateway.archive.rows import rfc3339
+from gateway.archive.store import Cursor, store_at
+from gateway.bridges.program import Gateways
+from gateway.bridges.program import run as run_program
+from gateway.cli.terminal import ROUTER, AsJson, ZenohFile, out, printable
+from gateway.contract.line_faults import span
+
+cli = typer.Typer(help="The histories of many gateways in one store.", no_args_is_help=True)
+
+_ROUTERS = [ROUTER]  # typer copies it
+_PLACE = "A folder, s3://bucket/folder, postgresql://user@host/database, or an address of InfluxDB."
+Place = Annotated[str, typer.Argument(metavar="STORE", help=_PLACE)]
+
+
+@cli.callback()
+def commands() -> None:
+    """The histories of many gateways in one store."""
+
+
+@cli.command()
+def run(
+    store: Place,
+    connect: Annotated[
+        list[str], typer.Option(metavar="ENDPOINT", help="A gateway or a router; several: spare.")
+    ] = _ROUTERS,
+    zenoh: ZenohFile = None,
+    prefix: Annotated[str, typer.Option(help="zenoh.prefix of the gateways.")] = "plant",
+    every: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=86400, help="Seconds between two looks (folder, S3: 300; 10)."),
+    ] = None,
+    rate: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Samples a second of a gateway, at most.")
+    ] = 10_000,
+) -> None:
+    """Archive each sample of each history once, until Ctrl-C."""
+    run_program(archive(Gateways(connect, zenoh, prefix), store, every, rate))
+
+
+@cli.command()
+def status(store: Place, as_json: AsJson = False) -> None:
+    """Print how far each gateway is archived, and what is missing."""
+    opened = store_at(store)
+    try:
+        cursors = sorted(opened.cursors().values(), key=lambda cursor: cursor.gateway)
+    finally:
+        opened.close()
+    now = time.time()
+    if as_json:
+        for cursor in cursors:
+            print(json.dumps(_document(cursor, now)))
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("gateway", "samples", "newest", "behind", "gaps"):
+        table.add_column(column)
+    for cursor in cursors:
+        document = _document(cursor, now)
+        behind = "-" if document["behind"] is None else span(float(str(document["behind"])))
+        table.add_row(
+            Text(printable(cursor.gateway)),
+            Text(str(cursor.samples)),
+            Text(str(document["newest"] or "-")),
+            Text(behind),
+            Text(str(len(cursor.gaps))),
+        )
+    out.print(table)
+    for cursor in cursors:
+        for gap in cursor.gaps:
+            out.print(printable(f"{cursor.gateway}: {gap.begin} to {gap.end}: {gap.why}"))
+
+
+def _document(cursor: Cursor, now: float) -> dict[str, object]:
+    """`behind`: seconds since the store had everything; None: it never had."""
+    return {
+        "gateway": cursor.gateway,
+        "samples": cursor.samples,
+        "newest": rfc3339(cursor.newest) if cursor.newest else None,
+        "behind": round(max(0.0, now - cursor.whole / 1e6), 1) if cursor.whole else None,
+        "gaps": [{"from": gap.begin, "to": gap.end, "why": gap.why} for gap in cursor.gaps],
+    }

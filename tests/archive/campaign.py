@@ -1,0 +1,133 @@
+"""Kills archivers, databases and gateways at random: `make archive KILLS=200 SEED=7`.
+
+Two gateways poll simulated PLCs as fast as they can. A random program is killed by SIGKILL at a
+random moment, and started again. In the end the store has each sample that the gateways have on
+their disks, once, and the cursors count them.
+"""
+
+import argparse
+import random
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from tests.archive.servers import Postgres, postgres
+from tests.archive.test_archive import Found, Hall, archived, archiver, recorded, status
+from tests.e2e.processes import Program, until
+from tests.zenoh_peer import free_endpoint
+
+LONGEST = 1.5  # seconds between two kills
+
+
+def archived_in(server: Postgres) -> Found:
+    rows = server.rows(
+        "SELECT key, (extract(epoch FROM time) * 1000000)::bigint, reason FROM plc_history"
+    )
+    return Found(
+        (f"{str(key).split('/')[1].partition('-')[0]} {key}", at, reason)  # type: ignore[misc]  # columns
+        for key, at, reason in rows
+    )
+
+
+class Campaign:
+    """The programs of a plant, each of which can be killed and started again."""
+
+    def __init__(self, folder: Path, server: Postgres | None) -> None:
+        self._endpoint, self._server = free_endpoint(), server
+        self._store: object = folder / "archive" if server is None else server.address
+        self._folder = folder
+        self._halls = [
+            Hall(folder, "demo", self._endpoint, listen=[self._endpoint]),
+            Hall(folder, "other", self._endpoint, connect=[self._endpoint], mode="client"),
+        ]
+        self._running: dict[str, Program] = {}
+        self._start: dict[str, Callable[[], Program]] = {
+            "archiver": lambda: archiver(self._store, self._endpoint),
+            "demo": self._halls[0].run,
+            "other": self._halls[1].run,
+        }
+
+    def run(self, kills: int, choice: random.Random) -> Found:
+        """Returns the samples, after all of them are compared."""
+        with ExitStack() as ends:
+            ends.callback(self._end)
+            for name in ("demo", "other", "archiver"):
+                self._running[name] = self._start[name]()
+            self._running["archiver"].says("archived after")
+            for number in range(kills):
+                time.sleep(choice.uniform(0, LONGEST))  # the random moment
+                self._kill(choice.choice(self._names()))
+                if number % 20 == 19:
+                    print(f"{number + 1} kills, {self._count()} samples", flush=True)
+        with (
+            self._halls[0].run(idle=True),
+            self._halls[1].run(idle=True),
+            archiver(self._store, self._endpoint) as last,
+        ):
+            until(self._is_whole, "each sample is there once")
+            assert last.end() == 0
+        found = self._archived()
+        counted = status(self._store)
+        assert sum(int(row["samples"]) for row in counted.values()) == found.total()
+        assert all(row["gaps"] == [] for row in counted.values())
+        return found
+
+    def _names(self) -> list[str]:
+        often = ["archiver"] * 3  # it is up soonest
+        return [*often, "demo", "other", *(["database"] if self._server else [])]
+
+    def _kill(self, name: str) -> None:
+        if name == "database":
+            assert self._server is not None
+            self._server.kill()
+            self._server.start()
+            return
+        program = self._running.pop(name)
+        program.end(signal.SIGKILL)
+        self._running[name] = self._start[name]()
+
+    def _end(self) -> None:
+        for program in self._running.values():
+            if program.running:
+                program.end(signal.SIGKILL)
+
+    def _archived(self) -> Found:
+        store = self._folder / "archive"
+        return archived(store) if self._server is None else archived_in(self._server)
+
+    def _count(self) -> int:
+        return sum(int(row["samples"]) for row in status(self._store).values())
+
+    def _is_whole(self) -> bool:
+        truth = sum((recorded(hall.history, hall.name) for hall in self._halls), Found())
+        found = self._archived()
+        assert all(truth[one] == 1 for one in truth), "two samples of one time"
+        doubled = [one for one, count in found.items() if count > 1]
+        assert not doubled, doubled[:5]
+        return found == truth
+
+
+def campaign(store: str, kills: int, seed: int) -> int:
+    """Returns the number of samples. Raises `AssertionError` for a lost or doubled one."""
+    choice = random.Random(seed)
+    with tempfile.TemporaryDirectory() as name, ExitStack() as ends:
+        server = ends.enter_context(postgres()) if store == "postgres" else None
+        return Campaign(Path(name), server).run(kills, choice).total()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200, help="half of them for each store")
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    given = parser.parse_args()
+    for store in ("parquet", "postgres"):
+        print(f"{store}, seed {given.seed}", flush=True)
+        samples = campaign(store, given.kills // 2, given.seed)
+        print(f"{store}: {given.kills // 2} kills, {samples} samples, none lost, none double")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""`archive run` beside gateways: what is in their histories is in the store, once."""
+
+import asyncio
+import json
+import signal
+import sqlite3
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pytest
+
+from tests.e2e.processes import (
+    Program,
+    gateway,
+    plc_gateway,
+    started,
+    until,
+    vigor_line,
+    write_config,
+)
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+Found = Counter[tuple[str, int, str | None]]  # key, microseconds, reason
+
+TAGS: dict[str, dict[str, Any]] = {
+    "speed": {"address": "D100"},
+    "total": {"address": "D110", "type": "uint64"},
+    "name": {"address": "D120", "type": "string[4]"},
+    "raw": {"address": "D130", "type": "string[4]", "payload": "raw"},
+    "steps": {"address": "D140", "type": "int16[3]"},
+}
+
+
+def archiver(store: object, endpoint: str, *options: object) -> Program:
+    where = ("--connect", endpoint, "--every", 0.1)
+    return gateway("archive", "run", store, *where, *options)
+
+
+def recorded(history: Path, gateway: str) -> Found:
+    """Returns what a gateway has on its disk."""
+    with closing(sqlite3.connect(history)) as database:
+        rows = database.execute("SELECT key, time / 1000, bad FROM history").fetchall()
+    return Counter((f"{gateway} plant/{key.partition('@')[0]}", at, bad) for key, at, bad in rows)
+
+
+def archived(store: Path) -> Found:
+    query = f"""SELECT gateway, key, epoch_us(time), reason
+        FROM read_parquet('{store}/*/*/*.parquet', hive_partitioning = true)"""  # noqa: S608
+    return Counter(
+        (f"{gateway.rpartition(',')[2]} {key}", at, reason)
+        for gateway, key, at, reason in duckdb.execute(query).fetchall()
+    )
+
+
+def status(store: object) -> dict[str, dict[str, Any]]:
+    done = plc_gateway("archive", "status", store, "--json")
+    rows = map(json.loads, done.out.splitlines())
+    return {row["gateway"].rpartition("/")[2]: row for row in rows}
+
+
+class Hall:
+    """A gateway with a simulated PLC. `idle`: it polls nothing."""
+
+    def __init__(self, folder: Path, name: str, endpoint: str, **how: Any) -> None:
+        self.folder, self.name = folder / name, name
+        self.folder.mkdir()
+        self.history = self.folder / "history.db"
+        self._endpoint, self._how = endpoint, how
+
+    def run(self, *, idle: bool = False) -> Program:
+        device = {"protocol": "vigor", "station": 1, "enabled": not idle, "tags": TAGS}
+        lines = {"hall": {"port": "simulator", "devices": {f"{self.name}-plc": device}}}
+        file = write_config(
+            self.folder / "c.yaml",
+            self._endpoint,
+            lines,
+            gateway={"name": self.name},
+            zenoh={"prefix": "plant", "listen": [], "connect": [], **self._how},
+            defaults={"every": "50ms", "history": True},
+            history={"path": "history.db"},
+        )
+        return started(file)
+
+
+def have_all(store: Path, halls: list[Hall]) -> Callable[[], bool]:
+    def check() -> bool:
+        truth = sum((recorded(hall.history, hall.name) for hall in halls), Found())
+        return archived(store) == truth
+
+    return check
+
+
+def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(tmp_path: Path) -> None:
+    """Archivers take over from each other; a history is moved aside, and comes back."""
+    endpoint, store = free_endpoint(), tmp_path / "archive"
+    demo = Hall(tmp_path, "demo", endpoint, listen=[endpoint])
+    other = Hall(tmp_path, "other", endpoint, connect=[endpoint], mode="client")
+    with ExitStack() as ends:
+        for hall in (demo, other):
+            ends.enter_context(hall.run())
+        first = ends.enter_context(archiver(store, endpoint))
+        first.says("this archiver is at work")
+        first.says("plant/@gateway/other: archived after the beginning")
+        second = ends.enter_context(archiver(store, endpoint))
+        second.says("another archiver of this store is at work: this one waits")
+        until(lambda: len(status(store)) == 2, "both gateways are archived")
+        first.end(signal.SIGKILL)
+        second.says("this archiver is at work")
+        before = status(store)
+        until(lambda: status(store)["demo"]["samples"] > before["demo"]["samples"], "it goes on")
+        second.end(signal.SIGKILL)
+
+    with demo.run(idle=True), other.run(idle=True), archiver(store, endpoint) as third:
+        until(have_all(store, [demo, other]), "each sample is there once")
+        assert third.end() == 0
+    now = status(store)
+    assert now["demo"]["samples"] == recorded(demo.history, "demo").total()
+    assert now["demo"]["gaps"] == []
+    assert float(now["demo"]["behind"]) < 3600
+
+    aside = demo.history.rename(f"{demo.history}.aside-20261126T120000Z")
+    with demo.run(), archiver(store, endpoint) as fourth:
+        fourth.says("its history is another file")
+    assert plc_gateway("history", "salvage", demo.folder / "c.yaml").code == 0
+    assert not aside.exists()
+    with demo.run(idle=True), archiver(store, endpoint) as fifth:
+        fifth.says("its history is another file")
+        until(have_all(store, [demo, other]), "nothing is there twice")
+    rows = duckdb.execute(
+        f"SELECT DISTINCT origin, typeof(value) FROM '{store}/*/*/*.parquet'"  # noqa: S608
+    ).fetchall()
+    assert ("simulated", "DOUBLE") in rows
+    shown = plc_gateway("archive", "status", store)
+    assert "plant/@gateway/other" in shown.out
+    assert "its history is another file: samples may be missing" in shown.out
+
+
+def test_a_gateway_without_history_is_named_once(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    line = vigor_line("simulator", {"speed": {"address": "D100"}})
+    file = write_config(tmp_path / "c.yaml", endpoint, {"hall": line})
+    with started(file), archiver(tmp_path / "archive", endpoint) as program:
+        program.says("plant/@gateway/demo: no-history: no history is kept here")
+        assert program.end() == 0
+
+
+async def test_the_page_of_a_gateway_has_its_samples_only(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with await asyncio.to_thread(Hall(tmp_path, "demo", endpoint, listen=[endpoint]).run):
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            await client.get_until("plant/demo-plc/speed", lambda known: known["quality"] == "good")
+            selector = "plant/@gateway/demo/page?_time=[..];page=1000"
+            *samples, end = await client.get(selector, accept_replies="ANY")
+            assert end.key == "plant/@gateway/demo/page"
+            assert end.json["samples"] == len(samples) > 5
+            assert all(str(one.key).startswith("plant/demo-plc/") for one in samples)
+
+
+@pytest.mark.parametrize("option", [("--every", "0"), ("--rate", "0"), ("--rate", "x")])
+def test_wrong_options_are_refused(option: tuple[str, str], tmp_path: Path) -> None:
+    done = plc_gateway("archive", "run", tmp_path / "archive", *option)
+    assert done.code == 2
+    assert option[0] in done.err
