@@ -52,6 +52,8 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "bridge mqtt": ("--broker mqtt://127.0.0.1:1883", "--broker mqtts://ana@broker --writes"),
     "bridge influx": ("", "--to 'http://127.0.0.1:8086/api/v2/write?org=o&bucket=plant'"),
+    "archive run": ("/srv/archive", "postgresql://archive@db/plant --connect tcp/router:7447"),
+    "archive status": ("/srv/archive", "postgresql://archive@db/plant --json"),
     "schema": ("", "--contract"),
     "version": ("",),
     "history export": (

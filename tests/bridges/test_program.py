@@ -33,7 +33,7 @@ def test_a_bridge_whose_library_loses_a_cancellation_ends_all_the_same(
 
 def test_a_bridge_without_its_packages_names_them() -> None:
     named = pytest.raises(ConfigError, match="pip install aiomqtt protobuf")
-    with named, program.packages_of("mqtt"):
+    with named, program.packages_of("bridge mqtt"):
         raise ModuleNotFoundError("no", name="aiomqtt")
-    with pytest.raises(ModuleNotFoundError), program.packages_of("mqtt"):
+    with pytest.raises(ModuleNotFoundError), program.packages_of("bridge mqtt"):
         raise ModuleNotFoundError("no", name="gateway.bridges.none")

@@ -2,6 +2,8 @@
 
 import json
 import time
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -61,23 +63,32 @@ def status(store: Place, as_json: AsJson = False) -> None:
         for cursor in cursors:
             print(json.dumps(_document(cursor, now)))
         return
+    out.print(
+        _table(("gateway", "samples", "newest", "behind"), map(partial(_cells, now), cursors))
+    )
+    if gaps := [(cursor.gateway, gap) for cursor in cursors for gap in cursor.gaps]:
+        cells = ((gateway, _second(gap.begin), _second(gap.end), gap.why) for gateway, gap in gaps)
+        out.print(_table(("gateway", "from", "to", "may be missing"), cells))
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Table:
     table = Table(box=None, pad_edge=False)
-    for column in ("gateway", "samples", "newest", "behind", "gaps"):
+    for column in columns:
         table.add_column(column)
-    for cursor in cursors:
-        document = _document(cursor, now)
-        behind = "-" if document["behind"] is None else span(float(str(document["behind"])))
-        table.add_row(
-            Text(printable(cursor.gateway)),
-            Text(str(cursor.samples)),
-            Text(str(document["newest"] or "-")),
-            Text(behind),
-            Text(str(len(cursor.gaps))),
-        )
-    out.print(table)
-    for cursor in cursors:
-        for gap in cursor.gaps:
-            out.print(printable(f"{cursor.gateway}: {gap.begin} to {gap.end}: {gap.why}"))
+    for row in rows:
+        table.add_row(*(Text(printable(cell or "-")) for cell in row))
+    return table
+
+
+def _cells(now: float, cursor: Cursor) -> tuple[str | None, ...]:
+    whole = cursor.whole / 1e6
+    behind = span(max(0.0, now - whole)) if whole else None
+    newest = rfc3339(cursor.newest) if cursor.newest else None
+    return cursor.gateway, str(cursor.samples), _second(newest), behind
+
+
+def _second(time: str | None) -> str | None:
+    return None if time is None else f"{time[:19]}Z"
 
 
 def _document(cursor: Cursor, now: float) -> dict[str, object]:

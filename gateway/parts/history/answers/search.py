@@ -239,7 +239,7 @@ def _deleted(
     """Yields `Damaged` if samples after the place were deleted to make room."""
     numbers = [*(run.number for run in runs[:1]), *(number for number, _, _ in newest if number)]
     if after is not None and numbers and (count := numbers[0] - after[1] - after[2] - 1) > 0:
-        yield Damaged(f"{count} samples were deleted before they were read"), after
+        yield Damaged(f"{count} samples were deleted unread"), after
 
 
 def _mark(file: Identity | None) -> str:
