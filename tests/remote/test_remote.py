@@ -161,6 +161,31 @@ def test_a_file_that_nobody_confirms_goes_back(
     run_virtual(whole())
 
 
+def test_each_change_has_its_own_time(run_virtual: Virtual, tmp_path: Path) -> None:
+    """One that was confirmed at once delays the way back of the next one by nothing."""
+
+    async def whole() -> None:
+        gateway = Gateway(tmp_path)
+        part = await gateway.part()
+
+        async def work() -> None:
+            found = await ask(part, "apply", file=file("D1"), confirm=HOUR)
+            await asyncio.sleep(1)
+            await ask(part, "confirm", digest=found["digest"])
+            await ask(part, "apply", file=file("D2"), confirm=60)
+            await asyncio.sleep(59)
+            assert part.document()["state"] == "waiting"
+            await asyncio.sleep(2)
+            assert (part.document()["state"], gateway.current.digest) == (
+                "reverted",
+                found["digest"],
+            )
+
+        await beside(part, work())
+
+    run_virtual(whole())
+
+
 def test_after_a_crash_in_the_middle_the_file_before_counts(
     run_virtual: Virtual, tmp_path: Path
 ) -> None:

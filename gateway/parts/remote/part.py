@@ -8,6 +8,7 @@ back after a restart, too. One change at a time; `keep` earlier files.
 
 import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -59,7 +60,7 @@ class RemotePart:
         self._saved = SavedFile(settings.path)
         self._change = Change()
         self._earlier: Sequence[str] = ()
-        self._began = asyncio.Event()  # a change waits
+        self._news = asyncio.Event()  # a change waits, or no longer
         self._ends_at = 0.0  # by the loop's clock
         self._busy = asyncio.Lock()
         self._active = False
@@ -79,8 +80,11 @@ class RemotePart:
 
     async def run(self) -> None:
         while True:
-            await self._began.wait()
-            await asyncio.sleep(self._ends_at - asyncio.get_running_loop().time())
+            self._news.clear()
+            waits = self._change.state == "waiting"
+            with suppress(TimeoutError):
+                async with asyncio.timeout_at(self._ends_at if waits else None):
+                    await self._news.wait()
             async with self._busy:
                 if self._change.state == "waiting" and not self._left():
                     await self._go_back("nobody confirmed it")
@@ -202,7 +206,7 @@ class RemotePart:
         change, now = self._change, self._core.plant.wall()
         seconds = min(max(0, change.until - now), change.until - change.at) / 1e9
         self._ends_at = asyncio.get_running_loop().time() + seconds
-        self._began.set()
+        self._news.set()
 
     def _left(self) -> float:
         return max(0.0, self._ends_at - asyncio.get_running_loop().time())
@@ -211,7 +215,7 @@ class RemotePart:
         """Returns when it is on disk. Raises `GatewayError`."""
         self._change = change
         if change.state != "waiting":
-            self._began.clear()
+            self._news.set()
         await off_loop(self._saved.save, orjson.dumps(asdict(change)), within=DISK_WITHIN)
         self._earlier = await off_loop(self._names, within=DISK_WITHIN)
         now = self._core.plant.wall()
