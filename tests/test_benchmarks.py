@@ -35,7 +35,15 @@ TINY = [
     (
         "fleet",
         "--gateways 4 --processes 2",
-        [r"^4 of 4 gateways in [\d.]+ s", r"^files that differ: 1 named, 0 ", r"killed: 2 missing"],
+        [
+            r"^4 of 4 gateways in [\d.]+ s",
+            r"^files that differ: 1 named, 0 ",
+            r"^checked: 4 good",
+            r"^a change on all: 4 confirmed",
+            r"^a bad file on all: given in [\d.]+ s, 4 are back",
+            r"^the router is back: (\d) run the new file, \1 were said to",
+            r"killed: 2 missing",
+        ],
     ),
     ("frames_noise", "0.07", [r"^gap +CR +[\d.]+ +[\d.]+ +[\d.]+$"]),
     (
