@@ -3,13 +3,20 @@
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress, count
 from operator import ne
-from typing import Any
+from typing import Any, NamedTuple
 
 from gateway.tags import Deadband, Publish, Quality, Reason, Sample, Tag, bad
 from gateway.tags.computed import Dependents, computed
 from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
 from gateway.values.numerals import are_apart
+
+
+class _InScan(NamedTuple):
+    """The place of a tag's latest sample in the latest scan of its block."""
+
+    latest: Latest
+    place: int
 
 
 class Mirror:
@@ -22,7 +29,8 @@ class Mirror:
 
     def __init__(self, tags: Iterable[Tag], now: int) -> None:
         """`now`: nanoseconds since 1970."""
-        self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
+        # The latest sample; None: nothing was read.
+        self._current: dict[Tag, Sample | _InScan | None] = dict.fromkeys(tags)
         self._dependents = Dependents(self._current)
         self.derives = bool(self._dependents)
         self.memories = {
@@ -30,11 +38,10 @@ class Mirror:
         }
         self.pending: set[Tag] = set()  # kept tags whose value an equal read can change
         self._raw = {tag.origin.inputs[0] for tag in self.memories}
-        self._current |= {tag: bad(tag, Reason.STARTING, now) for tag in self._raw}
+        self._current |= dict.fromkeys(self._raw)
+        # Not of a tag in a scan whose changes are all published.
         self._published: dict[Tag, Sample] = {}
-        self._begun = False
-        # Tags whose latest sample is in a scan, with their place there.
-        self._places: dict[Tag, tuple[Latest, int]] = {}
+        self._begun, self._first = False, now
 
     def begin(self, now: int) -> None:
         """Gives the first samples another time, once. Call it before the lines begin.
@@ -43,16 +50,19 @@ class Mirror:
         would keep the last value of the gateway that was active before.
         """
         if not self._begun:
-            self._begun = True
-            self._current = {tag: s._replace(time=now) for tag, s in self._current.items()}
+            self._begun, self._first = True, now
 
     def __getitem__(self, tag: Tag) -> Sample:
-        entry = self._places.get(tag)
-        if entry is None:
-            current = self._current[tag]
-            return self._derived(tag, current) if tag.origin.inputs else current
-        latest, place = entry
-        return latest.scan[place]
+        current = self._current[tag]
+        if isinstance(current, _InScan):
+            return current.latest.scan[current.place]
+        sample = self._stored(tag, current)
+        return self._derived(tag, sample) if tag.origin.inputs else sample
+
+    def _stored(self, tag: Tag, current: Sample | _InScan | None) -> Sample:
+        if isinstance(current, Sample):
+            return current
+        return bad(tag, Reason.STARTING, self._first) if current is None else self[tag]
 
     def samples(self) -> Iterable[Sample]:
         return (self[tag] for tag in self._current if tag not in self._raw)
@@ -128,7 +138,9 @@ class Mirror:
         """
         changed = []
         for sample in samples:
-            last = self._last_published(sample.tag)
+            if self._publishes_all(sample.tag):
+                continue
+            last = self._published.get(sample.tag)
             self._published[sample.tag] = sample
             if last is not None and last.value != sample.value:
                 changed.append(sample)
@@ -140,8 +152,9 @@ class Mirror:
         for sample in samples:
             self._current[sample.tag] = self._published[sample.tag] = sample
         for old, new in renewed.items():
-            self._current[new] = self[old]._replace(tag=new)
-            if (last := self._last_published(old)) is not None:
+            latest = self._current[new] = self[old]._replace(tag=new)
+            last = latest if self._publishes_all(old) else self._published.get(old)
+            if last is not None:
                 self._published[new] = last._replace(tag=new)
 
     def compute(self, first: Iterable[Sample], gone: Iterable[Tag]) -> list[Sample]:
@@ -164,25 +177,27 @@ class Mirror:
     def forget(self, tags: Iterable[Tag]) -> None:
         """Removes tags. Other threads must not look them up any more."""
         for tag in tags:
-            if tag in self._places:
-                self._supersede(self._places[tag][0])
+            current = self._current.get(tag)
+            if isinstance(current, _InScan):
+                self._supersede(current.latest)
             self._current.pop(tag, None)
             self._published.pop(tag, None)
 
-    def _last_published(self, tag: Tag) -> Sample | None:
-        entry = self._places.get(tag)
-        if entry is None or entry[1] in entry[0].by_rule:
-            return self._published.get(tag)
-        return self[tag]  # each change of it is published
+    def _publishes_all(self, tag: Tag) -> bool:
+        """True if each change of the tag is published: the last published sample is the latest."""
+        entry = self._current.get(tag)
+        return isinstance(entry, _InScan) and entry.place not in entry.latest.by_rule
 
     def _store(self, samples: Iterable[Sample]) -> list[Sample]:
-        current, published, places = self._current, self._published, self._places
+        current, published = self._current, self._published
         to_publish = []
         for sample in samples:
             tag = sample.tag
-            if tag in places:
-                self._supersede(places[tag][0])
-            if sample.quality is Quality.BAD and _same_failure(current[tag], sample):
+            before = current.get(tag)
+            if isinstance(before, _InScan):
+                self._supersede(before.latest)
+                before = current[tag]
+            if sample.quality is Quality.BAD and _same_failure(self._stored(tag, before), sample):
                 continue  # keeps the time when it became bad
             current[tag] = sample
             if _is_due(published.get(tag), sample):
@@ -193,9 +208,12 @@ class Mirror:
     def _adopt(self, latest: Latest, scan: Scan) -> None:
         """Finds the samples of these tags in the scan from now on. They were stored already."""
         tags = scan.tags
-        scan.failures = {place: self._current[tags[place]] for place in scan.failures}
+        scan.failures = {place: self[tags[place]] for place in scan.failures}
         latest.adopt(scan)
-        self._places |= {tag: (latest, place) for place, tag in enumerate(tags)}
+        for place, tag in enumerate(tags):
+            self._current[tag] = _InScan(latest, place)
+            if place not in latest.by_rule:
+                self._published.pop(tag, None)
 
     def _renew(self, latest: Latest, scan: Scan) -> Sequence[Sample]:
         """Replaces the scan of a block by the next one. Returns the samples to publish."""
@@ -227,11 +245,9 @@ class Mirror:
         """Takes the samples out of a scan: one of its tags got another sample."""
         latest.superseded, latest.in_use = True, False
         for place, sample in enumerate(latest.scan):
-            # Before its entry goes: other threads must find one or the other.
-            self._current[sample.tag] = sample
+            self._current[sample.tag] = sample  # in one step: other threads find it or the scan
             if place not in latest.by_rule:
                 self._published[sample.tag] = sample
-            del self._places[sample.tag]
 
 
 def _place(tag: Tag) -> str:

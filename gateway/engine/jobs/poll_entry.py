@@ -42,7 +42,7 @@ class BlockReads:
         scan = self.scan
         if scan is None or scan.latest.superseded:
             scan = self.scan = block.decoder.first(units, time)
-        elif units == scan.units:
+        elif units is scan.units or units == scan.units:
             scan.time = time
         else:
             scan = self.scan = block.decoder.after(scan, units, time)

@@ -87,9 +87,13 @@ def bits_in(count: int) -> Callable[[bytes], Sequence[int]]:
 def words_in(count: int) -> Callable[[bytes], Sequence[int]]:
     """Returns a decoder of `count` words in a reply to function 03 or 04: high byte first."""
     words = Struct(f">{count}H")
+    last, found = b"", tuple[int, ...]()
 
     def unpack(pdu: bytes) -> Sequence[int]:
-        return words.unpack_from(pdu, 2)
+        nonlocal last, found
+        if pdu != last:  # an equal reply gives the same units: they are not compared one by one
+            last, found = pdu, words.unpack_from(pdu, 2)
+        return found
 
     return unpack
 
