@@ -1,22 +1,44 @@
 """`bridge opcua` with many tags: changes a second at a client that watches all, CPU, losses.
 
-python -m benchmarks.bridge_opcua --tags 20000 --rates 1000 4000
+python -m benchmarks.bridge_opcua --tags 20000 --rates 1000 4000 --security encrypt --sessions 100
+
+`--sessions`: so many clients besides, with ten tags each; the limits of the bridge are raised.
 """
 
 import argparse
 import asyncio
+import logging
 import os
 import sys
+import tempfile
 import time
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 from asyncua import Client, ua
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
+from tests.bridges.opcua_clients import TOKENS, URI, folder
 from tests.bridges.played import PlayedGateway
 from tests.e2e.processes import Program, free_port
 from tests.zenoh_peer import free_endpoint
 
 AT_ONCE = 1_000  # monitored items in one request
+OF_EACH = 10  # tags that one of many clients watches
+_RAISED = """
+import sys
+from gateway.bridges.opcua import admission as limits
+limits.MOST_CONNECTIONS = limits.MOST_OF_HOST = limits.MOST_SESSIONS = {most}
+limits.MOST_OF_USER = limits.MOST_SUBSCRIPTIONS = {most}
+from gateway.cli.main import main
+main()
+"""
+
+
+MODES = {
+    "sign": ua.MessageSecurityMode.Sign,
+    "encrypt": ua.MessageSecurityMode.SignAndEncrypt,
+}
 
 
 class Counter:
@@ -42,16 +64,38 @@ def megabytes(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-async def measure(tags: int, rates: list[int], seconds: float) -> None:
+async def connected(stack: AsyncExitStack, url: str, security: str, path: Path) -> Client:
+    """Returns a client with certificate and user; without security there is neither."""
+    client = Client(url, timeout=120, watchdog_intervall=60)
+    if security != "none":
+        client.application_uri = URI
+        client.set_user("ana")
+        client.set_password(TOKENS["ana"])
+        await client.set_security(
+            SecurityPolicyBasic256Sha256,
+            path / "pki" / "trusted" / "scada.der",
+            path / "client.pem",
+            mode=MODES[security],
+        )
+    return await stack.enter_async_context(client)
+
+
+async def measure(
+    path: Path, tags: int, rates: list[int], seconds: float, security: str, sessions: int
+) -> None:
     keys = [f"device-{number // 250:02}/tag-{number % 250:03}" for number in range(tags)]
     about = {key: {"type": "float64", "unit": "rpm"} for key in keys}
     endpoint, url = free_endpoint(), f"opc.tcp://127.0.0.1:{free_port()}"
-    options = ("--listen", url, "--anonymous", "--security", "none")
-    command = ("-m", "gateway", "bridge", "opcua", "--connect", endpoint, *options)
+    folder(path)
+    options: tuple[object, ...] = ("--listen", url, "--security", security, "--anonymous")
+    options = (*options, "--pki", path / "pki", "--users", path / "users.txt")
+    start = ("-c", _RAISED.format(most=sessions + 10)) if sessions else ("-m", "gateway")
+    command = (*start, "bridge", "opcua", "--connect", endpoint, *options)
     with PlayedGateway(endpoint, about) as gateway, Program(sys.executable, *command) as bridge:
         await asyncio.to_thread(bridge.says, "listening")
         begun, counter = time.monotonic(), Counter()
-        async with Client(url, timeout=120) as client:
+        async with AsyncExitStack() as stack:
+            client = await connected(stack, url, security, path)
             last = client.get_node(f"ns=2;s={keys[-1]}")
             while not await is_there(last):
                 await asyncio.sleep(0.1)
@@ -67,6 +111,19 @@ async def measure(tags: int, rates: list[int], seconds: float) -> None:
                 f"{time.monotonic() - there:.1f} s ({used(bridge.pid) - before:.1f} s of CPU), "
                 f"{megabytes(bridge.pid):.0f} MB"
             )
+            there, before = time.monotonic(), used(bridge.pid)
+            for number in range(sessions):
+                one = await connected(stack, url, security, path)
+                mine = [keys[(number * OF_EACH + place) % tags] for place in range(OF_EACH)]
+                watching = await one.create_subscription(500, Counter())
+                await watching.subscribe_data_change(
+                    [one.get_node(f"ns=2;s={key}") for key in mine]
+                )
+            if sessions:
+                print(
+                    f"{sessions} more sessions after {time.monotonic() - there:.1f} s "
+                    f"({used(bridge.pid) - before:.1f} s of CPU), {megabytes(bridge.pid):.0f} MB"
+                )
             for rate in rates:
                 await offer(gateway, keys, rate, seconds, counter, bridge.pid)
 
@@ -107,8 +164,15 @@ def main() -> None:
     parser.add_argument("--tags", type=int, default=20_000)
     parser.add_argument("--rates", type=int, nargs="+", default=[1_000, 2_000, 4_000])
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--security", choices=("none", *MODES), default="none")
+    parser.add_argument("--sessions", type=int, default=0)
     given = parser.parse_args()
-    asyncio.run(measure(given.tags, given.rates, given.seconds))
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as path:
+        made = Path(path) / "opcua"
+        asyncio.run(
+            measure(made, given.tags, given.rates, given.seconds, given.security, given.sessions)
+        )
 
 
 if __name__ == "__main__":
