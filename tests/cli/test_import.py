@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from gateway.config import load
 from gateway.config.yaml.insert import with_tags, written
 from gateway.errors import ConfigError
 from tests.cli.conftest import Command
+from tests.e2e.processes import ROOT
 from tests.sheets import plant
 
 FILE = """\
@@ -62,6 +64,16 @@ def test_300_tags_are_imported_and_the_comments_stay(command: Command, plant_fil
     assert plant_file.with_name("plant.yaml.bak").read_text("utf-8") == FILE
     assert files(plant_file.parent) == ["plant.yaml", "plant.yaml.bak", "tags.csv"]
     assert len(load(plant_file).devices[0].tags) == 300
+
+
+def test_tags_are_imported_into_a_file_with_computed_tags(
+    command: Command, plant_file: Path
+) -> None:
+    shutil.copy(ROOT / "config.example.yaml", plant_file)
+    tags = sheet(plant_file.parent, "Name,Address\nof-the-sheet,D700\n")
+    done = command("import", tags, "--into", plant_file, "--device", "mixer")
+    assert (done.code, done.err) == (0, "")
+    assert "          of-the-sheet: {address: D700}\n" in plant_file.read_text("utf-8")
 
 
 def test_with_one_mistake_nothing_is_written(command: Command, plant_file: Path) -> None:

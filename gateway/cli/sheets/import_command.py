@@ -1,5 +1,6 @@
 """The `import` command: tags of a sheet into the configuration, all or none."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -208,4 +209,7 @@ def _meaning(config: Config) -> dict[str, tuple[object, ...]]:
 
 
 def _settings(tag: Tag) -> tuple[object, ...]:
-    return tuple(getattr(tag, one.name) for one in fields(tag) if one.init)
+    """Returns what the file says of a tag: tags are equal to themselves only."""
+    values = {one.name: getattr(tag, one.name) for one in fields(tag) if one.init}
+    values["origin"] = dataclasses.replace(tag.origin, inputs=())
+    return (*values.values(), *map(_settings, tag.origin.inputs))
