@@ -8,9 +8,11 @@ copies those of the pages to `docs/`.
 
 import argparse
 import asyncio
+import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack
 from functools import partial
@@ -19,12 +21,14 @@ from typing import Any
 
 import yaml
 
+from benchmarks.fleet import report
 from benchmarks.start import Sizes, rows
 from gateway.contract.languages import LANGUAGES, Language
+from gateway.parts.web.fleet.api import ASK_EVERY
 from tests.cli.bench_page import BenchPage, benched, shown
 from tests.e2e.processes import ROOT, free_port, plc_gateway, started
 from tests.web.browser import Tab, browser
-from tests.web.serving import TOKEN
+from tests.web.serving import TOKEN, serving
 from tests.zenoh_peer import free_endpoint
 
 SIZES = {"phone": (390, 844), "laptop": (1366, 768), "wall": (1920, 1080)}
@@ -232,10 +236,53 @@ async def look_at_bench(arguments: argparse.Namespace) -> None:
         assert tab.errors == []
 
 
+def many_gateways(number: int) -> Iterator[tuple[str, bytes, float]]:
+    """Yields the reports of gateways of a works, some of them with a fault."""
+    digest, now = "0a94e7da1f3c", time.time()
+    for at in range(number):
+        found = json.loads(report(at, digest))
+        found["load"] = (at * 37 % 90) / 100
+        if at % 10 == 4:
+            found["stand"] = ("active", "standby")[at // 10 % 2]
+        if at % 23 == 7:
+            found["faults"], found["devices"] = {"device-silent": 2}, {"up": 10, "silent": 2}
+            found["fault"] = "mixer is silent: no byte came back: check power, wiring and station"
+        if at % 41 == 3:
+            found["faults"], found["fault"] = {"history": 1}, "the disk of history is full"
+        if at % 31 == 5:
+            found["version"] = "0.9.2"
+        payload = json.dumps(found).encode()
+        yield f"works/hall-{at % 20}/@gateway/g{at}/report", payload, now
+
+
+async def look_at_fleet(arguments: argparse.Namespace) -> None:
+    """Few gateways, and many, some of which are silent."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        async with browser(arguments.chromium, Path(profile)) as tab:
+            for number, lost in ((24, 2), (1000, 15)):
+                async with serving(fleet=True) as client:
+                    client.north.fleet = partial(many_gateways, number)
+                    await client.ask("/api/fleet")
+                    client.north.fleet = partial(many_gateways, number - lost)
+                    await asyncio.sleep(ASK_EVERY)
+                    for size in arguments.sizes:
+                        for scheme in arguments.schemes:
+                            await tab.open("about:blank")
+                            await tab.look(*SIZES[size], dark=scheme == "dark")
+                            await tab.open(f"http://127.0.0.1:{client.port}/#fleet")
+                            await tab.until("document.querySelectorAll('#fleet-list li').length")
+                            wide = await tab.value("document.documentElement.scrollWidth")
+                            assert wide <= SIZES[size][0], f"fleet is {wide} wide on a {size}"
+                            name = f"fleet-{number}-{size}-{scheme}.png"
+                            await tab.screenshot(arguments.into / name)
+            assert tab.errors == []
+
+
 async def run(arguments: argparse.Namespace) -> None:
     arguments.into.mkdir(parents=True, exist_ok=True)
     if arguments.language == "en":
         await look_at_bench(arguments)
+    await look_at_fleet(arguments)
     ports = Ports()
     async with AsyncExitStack() as stack:
         await ports.serve(stack)

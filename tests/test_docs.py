@@ -154,6 +154,7 @@ def test_every_page_with_files_is_checked() -> None:
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *(
             "first-plant.md",
+            "fleet.md",
             "identity.md",
             "import.md",
             "peek.md",

@@ -189,6 +189,10 @@ class North(Protocol):
     async def documents(self, max_age: float) -> Mapping[str, Mapping[str, Any]]:
         """Returns the status documents by path, at most `max_age` seconds old."""
 
+    def reports(self) -> Iterable[tuple[str, bytes, float]]:
+        """Asks all gateways under the prefix; returns key, payload and arrival (s since 1970) of
+        each report. Blocks. Raises `GatewayError`."""
+
     def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
         """Publishes the document at `@gateway/<name>/<path>`. Never blocks: the publishing thread
         calls `make`, and only for the last of several."""

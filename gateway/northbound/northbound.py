@@ -33,6 +33,7 @@ from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming
 from gateway.northbound.session import exposures
+from gateway.northbound.session.everywhere import everywhere
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.northbound.session.one_process import only_process
 from gateway.northbound.session.session import CLOSE_WITHIN, forget_dead_routes, open_session
@@ -46,6 +47,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 STATUS_EVERY = 5.0  # seconds
 _ROUTERS_EVERY = 1.0  # seconds between two lost routers that count
+_REPORTS_WITHIN = 5.0  # seconds for a gateway that hangs
 _FLUSH_TIMEOUT = 0.5  # seconds for waiting puts when the gateway ends
 
 
@@ -149,6 +151,12 @@ class Northbound:
     async def documents(self, max_age: float) -> Mapping[str, Mapping[str, object]]:
         """Returns the status documents by path, at most `max_age` seconds old."""
         return await self._status.fields(max_age)
+
+    def reports(self) -> Iterable[tuple[str, bytes, float]]:
+        """Asks all gateways under the prefix, as `North.reports`."""
+        if (session := self._publisher.session) is None:
+            raise GatewayError("the Zenoh session is not open")
+        return everywhere(session, self.keys, "report", _REPORTS_WITHIN)
 
     async def write(
         self, tag: str, data: bytes, by: str, arrived: float

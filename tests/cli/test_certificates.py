@@ -58,7 +58,7 @@ def test_mistakes_are_named(
 def test_without_its_package_the_command_names_it(
     command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for module in ("authority", "signing"):
+    for module in ("authority", "signing", "state"):
         monkeypatch.delitem(sys.modules, f"gateway.cli.certificates.{module}", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     done = command("ca", "create", tmp_path)

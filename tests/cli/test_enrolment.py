@@ -21,6 +21,7 @@ from gateway.cli.certificates.authority import Authority, create
 from gateway.cli.certificates.code import Code
 from gateway.cli.certificates.serving import MOST_TRIES, serve
 from gateway.cli.certificates.signing import Holder
+from gateway.cli.certificates.state import sweep
 from gateway.contract.access.certificates import expires
 from gateway.errors import ConfigError, GatewayError, NotAllowed
 from tests.zenoh_peer import free_port
@@ -176,7 +177,7 @@ def test_a_code_expires_and_a_clock_set_back_does_not_bring_it_back(
     code = authority.invite(Holder("hall"), 90, HOUR)
     request, now = signing.request_for("hall", signing.new_key()), [code_time := 2e9]
     monkeypatch.setattr("time.time", lambda: now[0])
-    authority.sweep()
+    sweep(authority.folder)
     now[0] = code_time - 1e9
     with pytest.raises(NotAllowed, match="has expired"):
         authority.enrol("hall", code.secret, request)
@@ -356,7 +357,7 @@ async def test_two_programs_do_not_serve_one_folder(authority: Authority) -> Non
 def test_a_command_that_stands_still_delays_the_others_for_seconds_only(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.cli.certificates.authority.WAITS", 0.1)
+    monkeypatch.setattr("gateway.cli.certificates.state.WAITS", 0.1)
     with (authority.folder / "lock").open("rb+") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(GatewayError, match="another command holds"):

@@ -11,10 +11,10 @@ from typing import Any, cast
 import orjson
 import zenoh
 
-from gateway.cli.fleet.rows import State, Told, Wanted, rows, told_by, wanted_in
 from gateway.config import load
 from gateway.config.loading import dumped
 from gateway.contract.documents.fleet import ReportDocument
+from gateway.contract.fleet_rows import State, Told, Wanted, rows, told_by, wanted_in
 from tests.cli.conftest import Command
 from tests.e2e.processes import plc_gateway
 from tests.zenoh_peer import free_endpoint

@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
@@ -100,6 +100,8 @@ class PlainNorth:
         self.endings: dict[bytes, WriteResult | Failure | GroupResult] = {}
         self.written: list[tuple[str, bytes, str]] = []
         self.began = asyncio.Event()
+        self.fleet: Callable[[], Iterable[tuple[str, bytes, float]]] = list
+        self.asked = 0  # for reports
         self.gate = asyncio.Event()  # writes wait for it
         self.gate.set()
         self.orders: Callable[[str, bytes, str | None], Awaitable[bytes]] | None = None
@@ -136,6 +138,10 @@ class PlainNorth:
         await self.gate.wait()
         self.written.append((tag, data, by))
         return self.endings.get(data, Failure(Problem.UNKNOWN_TAG, "no such tag"))
+
+    def reports(self) -> Iterable[tuple[str, bytes, float]]:
+        self.asked += 1
+        return self.fleet()
 
     def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
         raise AssertionError("the web publishes nothing")

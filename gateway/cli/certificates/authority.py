@@ -1,28 +1,19 @@
-"""The folder of an authority: its key, whom it invited, what it signed and revoked.
+"""The authority of a folder: invites, signs, renews and revokes.
 
-Several commands may use the folder at once: each change holds a lock, and is on disk before it is
-answered. The folder has the key of the plant: only its owner may read it.
+The folder has the key of the plant: only its owner may read it.
 """
 
-import fcntl
 import hmac
-import os
 import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 
-from pydantic import BaseModel, ValidationError
-
-from gateway import files
 from gateway.cli.certificates import signing
 from gateway.cli.certificates.code import Code, new_secret
 from gateway.cli.certificates.signing import Holder, Pair
+from gateway.cli.certificates.state import Entry, Invitation, State, changing, keep, load, read
 from gateway.contract.access.secrets import closed_to_others
-from gateway.errors import ConfigError, GatewayError, NotAllowed
-from gateway.plant.saved_file import SavedFile
+from gateway.errors import ConfigError, NotAllowed
 
 AUTHORITY_DAYS, SERVER, REVOKED = 3650, "server", "revoked.pem"
 WAITS = 5.0  # seconds for another command
@@ -30,37 +21,6 @@ MOST_NAMES = 10_000
 MOST_SERIALS = 50  # of a name: each after two thirds of the life of the one before
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}\Z")
 _TAKEN = {"ca", SERVER, "revoked", "authority"}  # names of files in the folder
-
-
-class Invitation(BaseModel):
-    """An open code. `until`: s since 1970. `used_by`: the digest of the key that used it; the same
-    key may ask again, because the answer may be lost."""
-
-    secret: str
-    until: float
-    used_by: str = ""
-
-
-class Entry(BaseModel):
-    """One name. `serials`: of its certificates, with their ends in s since 1970. `latest`: the last
-    certificate, in PEM form; empty before the first."""
-
-    addresses: list[str]
-    is_client: bool
-    days: float
-    serials: dict[str, float] = {}
-    latest: str = ""
-    is_revoked: bool = False
-
-
-class State(BaseModel):
-    """What the authority remembers. `at`: host and port where it is reached. `revoked`: serial
-    numbers with the time, s since 1970."""
-
-    at: str = ""
-    names: dict[str, Entry] = {}
-    invitations: dict[str, Invitation] = {}
-    revoked: dict[str, float] = {}
 
 
 def create(folder: Path, days: int) -> Path:
@@ -106,7 +66,7 @@ class Authority:
 
     def serve_at(self, at: str) -> None:
         """Keeps the address, and makes a certificate for it. Raises `GatewayError`."""
-        with self._changing() as state:
+        with changing(self.folder) as state:
             state.at = at
             holder = Holder(SERVER, [at.rpartition(":")[0].strip("[]")])
             key = signing.new_key()
@@ -116,7 +76,7 @@ class Authority:
 
     def invite(self, holder: Holder, days: float, within: float) -> Code:
         """Returns a code that is good once, for `within` seconds. Raises `GatewayError`."""
-        with self._changing() as state:
+        with changing(self.folder) as state:
             if not state.at:
                 raise ConfigError(
                     "gateways must know where to enrol: start "
@@ -130,7 +90,7 @@ class Authority:
     def issue(self, holder: Holder, days: float) -> Path:
         """Makes key and certificate here, and returns the certificate. Raises `GatewayError`."""
         file, key = self.folder / f"{holder.name}.pem", signing.new_key()
-        with self._changing() as state:
+        with changing(self.folder) as state:
             entry = self._enter(state, holder, days)
             made = self._signed(entry, holder, key.public_key())
             entry.is_revoked = False
@@ -141,7 +101,7 @@ class Authority:
 
     def revoke(self, name: str) -> Entry:
         """Revokes all certificates of a name, and its code. Raises `GatewayError`."""
-        with self._changing() as state:
+        with changing(self.folder) as state:
             entry = state.names.get(name)
             if entry is None:
                 known = ", ".join(sorted(state.names)[:20]) or "none"
@@ -154,15 +114,8 @@ class Authority:
             return entry
 
     def state(self) -> State:
-        """Raises `ConfigError`: without its memory an authority would forget whom it revoked."""
-        file = self.folder / "authority.json"
-        if not file.exists():
-            return State()
-        try:
-            return State.model_validate_json(read(file))
-        except ValidationError as error:
-            what = f"{error.error_count()} mistakes"
-            raise ConfigError(f"{file} is damaged ({what}): restore it from a backup") from None
+        """Raises `ConfigError`."""
+        return load(self.folder)
 
     # -- programs --
 
@@ -170,7 +123,7 @@ class Authority:
         """Returns the certificate for the request of a newcomer. Raises `NotAllowed`, and
         `GatewayError` for what is not the newcomer's fault."""
         key = signing.key_of_request(request)
-        with self._changing() as state:
+        with changing(self.folder) as state:
             found = state.invitations.get(name)
             if found is None or not hmac.compare_digest(found.secret.encode(), secret.encode()):
                 raise NotAllowed("this code is not known, or has expired: invite again")
@@ -192,7 +145,7 @@ class Authority:
         name, serial = signing.name_of(old), _serial(old)
         if not signing.is_issued_by(old, self._own.certificate) or old.public_key() != key:
             raise NotAllowed("this certificate is of another authority, or of another key")
-        with self._changing() as state:
+        with changing(self.folder) as state:
             entry = state.names.get(name)
             if entry is None or entry.is_revoked or serial in state.revoked:
                 raise NotAllowed(f"the certificate of {name} is revoked")
@@ -201,52 +154,11 @@ class Authority:
                 raise NotAllowed(f"{name} has enrolled again with another key")
             if time.time() > old.not_valid_after_utc.timestamp():
                 raise NotAllowed(f"the certificate of {name} has ended: invite it again")
-            if not is_due(latest):
+            if not signing.is_due(latest):
                 return entry.latest.encode()
             return self._signed(entry, _holder(name, entry), key)
 
-    def sweep(self) -> None:
-        """Forgets codes that have expired: a clock set back does not bring them back."""
-        with self._changing():
-            pass
-
     # -- inside --
-
-    @contextmanager
-    def _changing(self) -> Iterator[State]:
-        """Yields the state, and keeps its changes, also if an error is raised. Raises
-        `GatewayError`."""
-        try:
-            lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise GatewayError(f"{self.folder}: {error.strerror}") from None
-        try:
-            self._take(lock)
-            state = self.state()
-            before = state.model_dump_json()
-            now = time.time()
-            for name, one in list(state.invitations.items()):
-                if one.until < now:
-                    del state.invitations[name]
-            try:
-                yield state
-            finally:
-                if state.model_dump_json() != before:
-                    text = state.model_dump_json(indent=1)
-                    keep(self.folder / "authority.json", text.encode())
-        finally:
-            os.close(lock)
-
-    def _take(self, lock: int) -> None:
-        """Raises `GatewayError` while another command holds the folder, which may stand still."""
-        until = time.monotonic() + WAITS
-        while True:
-            try:
-                return fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    raise GatewayError(f"another command holds {self.folder}") from None
-            time.sleep(0.02)
 
     def _enter(self, state: State, holder: Holder, days: float) -> Entry:
         """Returns the entry of a name, with what it shall have from now on."""
@@ -272,31 +184,6 @@ class Authority:
         entry.serials = dict([*entry.serials.items(), (_serial(made), ends)][-MOST_SERIALS:])
         entry.latest = signing.pem(made).decode()
         return signing.pem(made)
-
-
-def is_due(certificate: signing.Certificate) -> bool:
-    """Returns True in the last third of its life, and before it: a clock was wrong."""
-    begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    return not begin <= datetime.now(UTC) <= end - (end - begin) / 3
-
-
-def read(file: Path) -> bytes:
-    """Raises `ConfigError`."""
-    try:
-        return files.read(file)
-    except OSError as error:
-        raise ConfigError(f"{file}: {error.strerror}") from None
-
-
-def keep(file: Path, data: bytes) -> None:
-    """Replaces a file, which only its owner can read. It is on disk when this returns.
-
-    Raises `GatewayError`.
-    """
-    saved = SavedFile(file)
-    saved.save(data)
-    if saved.trouble:
-        raise GatewayError(f"{file} cannot be written: {saved.trouble}")
 
 
 def _holder(name: str, entry: Entry) -> Holder:

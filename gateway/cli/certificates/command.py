@@ -22,8 +22,9 @@ from gateway.contract.access.certificates import expires
 from gateway.errors import ConfigError
 
 if TYPE_CHECKING:
-    from gateway.cli.certificates.authority import Authority, Entry
+    from gateway.cli.certificates.authority import Authority
     from gateway.cli.certificates.signing import Holder
+    from gateway.cli.certificates.state import Entry
 
 cli = typer.Typer(help="The plant's own authority for certificates.", no_args_is_help=True)
 

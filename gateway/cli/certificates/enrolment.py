@@ -16,8 +16,9 @@ from typing import NamedTuple
 from pydantic import BaseModel, ValidationError
 
 from gateway.cli.certificates import signing
-from gateway.cli.certificates.authority import REVOKED, is_due, keep, read
+from gateway.cli.certificates.authority import REVOKED
 from gateway.cli.certificates.code import Code
+from gateway.cli.certificates.state import keep, read
 from gateway.config.settings.parsers import web_address
 from gateway.contract.access.secrets import closed_to_others
 from gateway.errors import ConfigError, GatewayError
@@ -76,7 +77,7 @@ def renew(folder: Path) -> tuple[Files, bool]:
     closed_to_others(found.key, "the key")
     context, before = _context(found.ca), read(found.certificate)
     is_new = False
-    if is_due(signing.certificate_of(before)):
+    if signing.is_due(signing.certificate_of(before)):
         key = signing.private_key_of(read(found.key))
         sent = {
             "certificate": before.decode(),

@@ -10,7 +10,8 @@ import structlog
 from aiohttp import web
 from pydantic import BaseModel, Field, ValidationError
 
-from gateway.cli.certificates.authority import REVOKED, SERVER, Authority, read
+from gateway.cli.certificates.authority import REVOKED, SERVER, Authority
+from gateway.cli.certificates.state import read, sweep
 from gateway.cli.line.simulate import stop_event
 from gateway.config.settings.parsers import web_address
 from gateway.errors import ConfigError, GatewayError, NotAllowed
@@ -64,7 +65,7 @@ class Desk:
         while True:
             await asyncio.sleep(SWEEP_EVERY)
             try:
-                await off_loop(self._authority.sweep, within=WITHIN)
+                await off_loop(sweep, self._authority.folder, within=WITHIN)
             except GatewayError as error:
                 log.error("codes not swept", why=str(error))  # noqa: TRY400
 

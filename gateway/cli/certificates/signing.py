@@ -135,6 +135,12 @@ def is_issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> 
     return True
 
 
+def is_due(certificate: Certificate) -> bool:
+    """Returns True in the last third of its life, and before it: a clock was wrong."""
+    begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    return not begin <= datetime.now(UTC) <= end - (end - begin) / 3
+
+
 def certificate_of(pem: bytes) -> x509.Certificate:
     """Raises `ConfigError`."""
     try:

@@ -1,7 +1,6 @@
 """The client of a running gateway: reads, writes, follows."""
 
 import json
-import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
@@ -20,6 +19,7 @@ from gateway.config import ZenohConfig
 from gateway.config.gateway_address import GatewayAddress
 from gateway.contract.keys import Keys
 from gateway.errors import GatewayError
+from gateway.northbound.session.everywhere import everywhere
 from gateway.values import Value
 
 if TYPE_CHECKING:
@@ -115,15 +115,9 @@ class Client:
         return Client(self._session, place, self._tell, self._user)
 
     def everywhere(self, path: str) -> Iterator[tuple[str, bytes, float]]:
-        """Yields key, payload and arrival (s since 1970) of a document of each gateway under the
+        """Returns key, payload and arrival (s since 1970) of a document of each gateway under the
         prefix. One that hangs delays the end by `REPLY_TIMEOUT`, and nothing else."""
-        for reply in self._session.get(
-            self._keys.everywhere(path),
-            timeout=REPLY_TIMEOUT,
-            consolidation=zenoh.ConsolidationMode.NONE,
-        ):
-            if reply.ok is not None:
-                yield str(reply.ok.key_expr), reply.ok.payload.to_bytes(), time.time()
+        return everywhere(self._session, self._keys, path, REPLY_TIMEOUT)
 
     def outcomes(self, since: str) -> list[dict[str, Any]] | None:
         """Returns the outcomes of writes since a time as in `_time`; None without history."""

@@ -18,10 +18,10 @@ from gateway.cli.client import Client
 from gateway.cli.fleet.health import read_remote
 from gateway.cli.fleet.place import Connect, Place
 from gateway.cli.fleet.rollout import DONE, KEY, Ended, Pace, Result, Rollout, Step
-from gateway.cli.fleet.rows import Told, Wanted, gateway_of, told_by
 from gateway.cli.terminal import FAILED, AsJson, ZenohFile, err, out, printable
 from gateway.config.settings.parsers import interval
 from gateway.contract.documents.fleet import RemoteDocument
+from gateway.contract.fleet_rows import Told, Wanted, gateway_of, told_by
 from gateway.contract.line_faults import span
 from gateway.errors import ConfigError, GatewayError
 

@@ -18,8 +18,8 @@ from gateway.cli.examples import epilog
 from gateway.cli.fleet.apply import apply
 from gateway.cli.fleet.place import Connect, Place
 from gateway.cli.fleet.render import render
-from gateway.cli.fleet.rows import Row, State, Told, rows, told_by
 from gateway.cli.terminal import FAILED, AsJson, ZenohFile, err, out, printable
+from gateway.contract.fleet_rows import Row, State, Told, rows, told_by
 from gateway.contract.line_faults import span
 from gateway.errors import GatewayError
 from gateway.plant.saved_file import SavedFile

@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 
 from gateway.cli.client import Client, connected
-from gateway.cli.fleet.rows import Wanted, wanted_in
 from gateway.cli.terminal import ROUTER, err
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.gateway_address import GatewayAddress
+from gateway.contract.fleet_rows import Wanted, wanted_in
 from gateway.errors import ConfigError
 
 Connect = Annotated[

@@ -77,6 +77,11 @@ class Publisher:
             "congested": self._losses.congested,
         }
 
+    @property
+    def session(self) -> zenoh.Session | None:
+        """The open session; None before and after."""
+        return None if self._closing else self._session
+
     def start(self, session: zenoh.Session) -> None:
         self._session = session
         for device, online in self._online.items():

@@ -99,6 +99,19 @@ _OWN: Mapping[str, Schema] = {
             ),
         },
     ),
+    "Fleet": _record(
+        {
+            "time": _about(TEXT, "UTC, when the gateways were asked"),
+            "took": _about({"type": "number"}, "Seconds until all had replied"),
+            "gateways": _list(
+                _about(
+                    _record({"gateway": TEXT, "state": TEXT, "says": TEXT}),
+                    "With the fields of its report, if it replied",
+                )
+            ),
+            "mistakes": _list(TEXT),
+        }
+    ),
     "PastAlarms": _record({"alarms": _list(ref("AlarmEvent"))}),
     "Alarms": _record(
         {"alarms": _list(ref("AlarmDocument")), "counts": ref("AlarmCounts"), "next": _NEXT}

@@ -17,6 +17,8 @@ from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events
+from gateway.parts.web.fleet import api as fleet
+from gateway.parts.web.fleet.api import FleetApi, with_fleet
 from gateway.parts.web.guard import Guard
 from gateway.parts.web.languages import catalogue_route
 from gateway.parts.web.line_past import Loads
@@ -56,6 +58,11 @@ class Server:
             *files_of(ASSETS, "page.html"),
             catalogue_route("page", config.language),
         ]
+        if config.fleet:
+            page = with_fleet((ASSETS / "page.html").read_bytes())
+            routes = [one for one in routes if one.path != "/"]
+            routes += [file_route("/", page, "text/html"), *files_of(fleet.ASSETS, "")]
+            routes += FleetApi(core).routes()
         self.description = openapi.document(routes)
         text = json.dumps(self.description, indent=2).encode()
         routes.append(file_route("/openapi.json", text, "application/json"))

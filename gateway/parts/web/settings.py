@@ -34,6 +34,8 @@ class WebSection(Section):
     alarm, a history or a unit."""
     language: Language | None = None
     """The language of the page, unless a person chooses another; left out: that of the browser."""
+    fleet: bool = False
+    """Show all gateways under the prefix too: docs/fleet.md."""
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
     origins: list[WebOrigin] = []

@@ -8,7 +8,7 @@ import "./lines.js";
 import { showTags } from "./tags.js";
 import { leaveTrend, showTrend } from "./trend.js";
 
-const VIEWS = ["overview", "tags", "alarms", "lines", "trend"];
+const VIEWS = [...document.querySelectorAll("nav a")].map((link) => link.dataset.view);
 
 function show() {
   const { view } = place();
