@@ -93,5 +93,8 @@ def run(bridge: Coroutine[Any, Any, None]) -> None:
             loop.add_signal_handler(signal.SIGTERM, stop)
         await task
 
-    with suppress(KeyboardInterrupt, asyncio.CancelledError):
-        asyncio.run(until_signal())
+    try:
+        with suppress(KeyboardInterrupt, asyncio.CancelledError):
+            asyncio.run(until_signal())
+    except ExceptionGroup as failed:  # of the tasks of a bridge: the first one ended the others
+        raise failed.exceptions[0] from None

@@ -1,6 +1,7 @@
 """`bridge influx` with InfluxDB, and with a server that fails."""
 
 import json
+import shlex
 import signal
 import sys
 import threading
@@ -225,3 +226,20 @@ async def test_a_gap_is_kept_until_it_is_filled(tmp_path: Path) -> None:
 def test_a_name_of_another_program_cannot_forge_a_field() -> None:
     line = line_of("a b/c,good=true x", document(7))
     assert line.startswith("plc,device=a\\ b,name=c\\,good\\=true\\ x value=7.0,good=true ")
+
+
+def test_lines_may_be_read_by_head() -> None:
+    """As docs/bridges.md has it: nothing is said of the reader that has gone."""
+    endpoint = free_endpoint()
+    words = [sys.executable, "-m", "gateway", "bridge", "influx", "--connect", endpoint]
+    with (
+        PlayedGateway(endpoint, TAGS) as gateway,
+        Program("bash", "-c", f"{shlex.join(words)} --every 0.1 | head -1") as shell,
+    ):
+        shell.says("gateway demo is there")
+        while shell.running:  # the bridge notices at its next line
+            gateway.put("mixer/speed", time.monotonic())
+            time.sleep(0.05)
+        shell.ended()
+    assert any(line.startswith("plc,device=mixer") for line in shell.lines)
+    assert not [line for line in shell.lines if "Traceback" in line or "closed" in line]

@@ -104,8 +104,8 @@ class Bridge:
         body = "\n".join([*(line.text for line in batch), *note]) + "\n"
         try:
             await asyncio.to_thread(self._post, body.encode())
-        except BrokenPipeError:
-            raise GatewayError("the standard output is closed") from None
+        except BrokenPipeError:  # `| head` has read enough
+            raise
         except (OSError, http.client.HTTPException) as error:
             if isinstance(error, urllib.error.HTTPError) and error.code in REFUSED:
                 self._refused += len(batch)
