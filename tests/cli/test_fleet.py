@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
+from urllib.request import urlopen
 
 import orjson
 import zenoh
@@ -16,7 +17,7 @@ from gateway.config.loading import dumped
 from gateway.contract.documents.fleet import ReportDocument
 from gateway.contract.fleet_rows import State, Told, Wanted, rows, told_by, wanted_in
 from tests.cli.conftest import Command
-from tests.e2e.processes import plc_gateway
+from tests.e2e.processes import free_port, plc_gateway, started, write_config
 from tests.zenoh_peer import free_endpoint
 
 REPORT: dict[str, Any] = {
@@ -193,6 +194,26 @@ def test_the_command_as_a_table_json_and_csv(tmp_path: Path) -> None:
         done = plc_gateway(*asked, "--csv")
         assert done.out.splitlines()[0].startswith("gateway,state,says,drift,clock_offset,")
         assert len(done.out.splitlines()) == 3
+
+
+def test_the_page_of_a_gateway_has_those_that_reply_to_its_query(tmp_path: Path) -> None:
+    endpoint, port = free_endpoint(), free_port()
+    file = write_config(
+        tmp_path / "office.yaml",
+        endpoint,
+        cast("dict[str, Any]", FILE["lines"]),
+        gateway={"name": "office"},
+        zenoh={"prefix": "works", "mode": "client", "listen": [], "connect": [endpoint]},
+        web={"listen": f"127.0.0.1:{port}", "fleet": True},
+    )
+    with gateways(endpoint, "a", "b"), started(file):
+        with urlopen(f"http://127.0.0.1:{port}/api/fleet", timeout=60) as reply:
+            found = json.load(reply)
+        assert {one["gateway"] for one in found["gateways"]} == {
+            *("works/a", "works/b", "works/office")
+        }
+        with urlopen(f"http://127.0.0.1:{port}/", timeout=60) as reply:
+            assert b"fleet.js" in reply.read()
 
 
 def test_a_folder_that_is_none(command: Command, tmp_path: Path) -> None:

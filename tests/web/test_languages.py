@@ -21,6 +21,7 @@ from gateway.transport import os_errors
 from tests.conftest import needs
 from tests.web.browser import browser
 from tests.web.serving import DOCUMENTS, calling, serving, transfer
+from tests.web.test_fleet import reports
 from tests.web.test_page import opened, oven, sign_in, text
 
 GATEWAY = Path(languages.__file__).parents[2]
@@ -28,6 +29,7 @@ ASSETS = {
     "page": (GATEWAY / "parts/web/assets", "page.html"),
     "bench": (GATEWAY / "cli/bench/assets", "bench.html"),
 }
+FLEET = GATEWAY / "parts/web/fleet/assets"
 TRANSLATED = [one for one in LANGUAGES if one != "en"]
 PARTS = ("page", "bench", "sentences")
 # Texts of the page in its scripts: t("…"), and both of several(…, "…", "…").
@@ -39,7 +41,8 @@ def shown(part: str) -> set[str]:
     """The texts of a page, as its files have them."""
     folder, document = ASSETS[part]
     found = set[str]()
-    for file in {*folder.glob("*.js"), ASSETS["page"][0] / "language.js"}:
+    files = {*folder.glob("*.js"), ASSETS["page"][0] / "language.js"}
+    for file in files | ({*FLEET.glob("*.js")} if part == "page" else set()):
         if file.name != "uplot.js":
             source = file.read_text()
             found |= {*_TEXT.findall(source)} | {one for two in _TWO.findall(source) for one in two}
@@ -189,6 +192,7 @@ DATA = [
     "ladder",
     *("speed", "pumps", "plc-gateway", "Ana", "alice", "sensor broken", "int16", "bool", "BUSY"),
     *("<img src=x onerror=alert(1)>", "D0", "tcp/10.0.0.1:7447", "7 bytes", "raw"),
+    *("works/north/", "one", "two", "three"),
     *("modem:/dev/ttyS0", "float64", "D100"),
 ]
 NO_BYTE = diagnosis(NoReply("no reply"), "")
@@ -219,6 +223,12 @@ def wrong() -> dict[str, Any]:
     }
 
 
+def gateways() -> Iterator[tuple[str, bytes, float]]:
+    """Reports of gateways: a good one, one with faults, an old one."""
+    sick: dict[str, object] = {"fault": NO_BYTE, "faults": {"1": 2}}
+    return reports(one={}, two=sick, three={"version": "1.0.0", "stand": "standby"})
+
+
 async def test_the_page_has_no_sentence_outside_its_catalogue(
     tmp_path: Path, tokens: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -227,13 +237,15 @@ async def test_the_page_has_no_sentence_outside_its_catalogue(
     latin = LATIN.replace("DATA", data)
     async with (
         browser(needs("chromium"), tmp_path / "profile") as tab,
-        serving(plant=oven(), tokens_file=tokens, language="de") as client,
+        serving(plant=oven(), tokens_file=tokens, language="de", fleet=True) as client,
     ):
         await tab.look(1366, 768)
         client.north.changed = wrong()
+        client.north.fleet = gateways
         client.north.orders = client.plant.parts.alarms.order
         client.north.endings[b"90"] = WriteResult(90, 0, 0.03, verified=True)
-        for view in ("overview", "tags", "alarms", "lines", "trend?tags=oven/temperature"):
+        views = ("overview", "tags", "alarms", "lines", "fleet", "trend?tags=oven/temperature")
+        for view in views:
             await opened(tab, client, view)
             await tab.until("!!document.querySelector('.view:not([hidden]) :is(li, .row b)')")
             await tab.until("!/[a-z]{3}/.test(document.querySelector('#live').innerText)")

@@ -2,11 +2,12 @@
 // while the view is looked at.
 
 import { byId, clock, h, keyed, moment, put, span, style } from "./dom.js";
+import { listed, said, several, t } from "./language.js";
 import { api } from "./stream.js";
 
 const EVERY = 10000; // ms
 const MOST_ROWS = 200; // the others are found by words
-const STATES = { missing: "missing", fault: "fault", look: "to look at", good: "good" };
+const STATES = { missing: t("missing"), fault: t("fault"), look: t("to look at"), good: t("good") };
 const SIGNS = { missing: "×", fault: "!", look: "?", good: "" };
 
 let all = [];
@@ -15,17 +16,17 @@ let only = ""; // a state
 let askedAt = -Infinity; // performance.now()
 let asking = false;
 
-document.querySelector("nav").append(h("a", { href: "#fleet", "data-view": "fleet" }, "Fleet"));
+document.querySelector("nav").append(h("a", { href: "#fleet", "data-view": "fleet" }, t("Fleet")));
 byId("main").append(
   h("section", { id: "view-fleet", className: "view", "aria-labelledby": "fleet-title", hidden: true },
     h("div", { className: "bar" },
-      h("h2", { id: "fleet-title", role: "status", "aria-live": "polite" }, "Gateways"),
-      h("div", { id: "fleet-states", role: "group", "aria-label": "States" }),
-      h("input", { id: "fleet-find", type: "search", placeholder: "Name, fault, version", "aria-label": "Find gateways", autocomplete: "off", oninput: show })),
-    h("ul", { id: "fleet-map", "aria-label": "Map of the gateways" }),
+      h("h2", { id: "fleet-title", role: "status", "aria-live": "polite" }, t("Gateways")),
+      h("div", { id: "fleet-states", role: "group", "aria-label": t("States") }),
+      h("input", { id: "fleet-find", type: "search", placeholder: t("Name, fault, version"), "aria-label": t("Find gateways"), autocomplete: "off", oninput: show })),
+    h("ul", { id: "fleet-map", "aria-label": t("Map of the gateways") }),
     h("div", { id: "fleet-sums" },
       ...["faults", "versions", "standby", "load"].map((name) => h("p", { id: `fleet-${name}`, className: "soft" }))),
-    h("ul", { id: "fleet-list", className: "rows", "aria-label": "Gateways" }),
+    h("ul", { id: "fleet-list", className: "rows", "aria-label": t("Gateways") }),
     h("p", { id: "fleet-more", className: "soft" })),
 );
 
@@ -34,7 +35,6 @@ const counted = (words) => {
   for (const word of words) found.set(word, (found.get(word) ?? 0) + 1);
   return [...found].sort((one, other) => other[1] - one[1]);
 };
-const joined = (pairs) => pairs.map(([word, number]) => `${word} ${number}`).join(" · ");
 const short = (name) => name.slice(prefix.length);
 
 async function ask() {
@@ -45,7 +45,10 @@ async function ask() {
   asking = false;
   const old = !reply?.ok;
   byId("view-fleet").classList.toggle("old", old);
-  if (old) return put("fleet-more", `Not asked: ${reply?.found.error ?? "no connection to the gateway"}. What is shown here may be old.`);
+  if (old) {
+    const why = said(reply?.found.error) ?? t("no connection to the gateway");
+    return put("fleet-more", `${t("Not asked: {why}.", { why })} ${t("What is shown here may be old.")}`);
+  }
   const { gateways, mistakes, time, took } = reply.found;
   all = gateways;
   const [first] = all;
@@ -61,7 +64,7 @@ async function ask() {
 
 function show() {
   const numbers = new Map(counted(all.map((one) => one.state)));
-  put("fleet-title", `${all.length} gateways`);
+  put("fleet-title", several(all.length, "{n} gateway", "{n} gateways"));
   keyed(byId("fleet-states"), Object.keys(STATES).filter((state) => numbers.has(state) || state === only), (state) => state, makeState, (button, state) => {
     put(button, `${numbers.get(state) ?? 0} ${STATES[state]}`);
     button.setAttribute("aria-pressed", String(state === only));
@@ -71,18 +74,20 @@ function show() {
   const chosen = new Set(found);
   style(byId("fleet-map"), all.length > 60 ? "small" : "");
   keyed(byId("fleet-map"), all, (one) => one.gateway, makeCell, (cell, one) => showCell(cell, one, chosen.has(one)));
-  put("fleet-faults", sum("Faults", joined(counted(all.flatMap((one) => Object.keys(one.faults ?? {}))))));
-  put("fleet-versions", sum("Versions", joined(counted(all.filter((one) => one.version).map((one) => one.version)))));
-  put("fleet-standby", sum("Standby groups", joined(counted(all.filter((one) => one.stand).map((one) => one.stand)))));
   const busy = all.filter((one) => one.load > 0).sort((one, other) => other.load - one.load).slice(0, 3);
-  put("fleet-load", sum("Busiest", busy.map((one) => `${short(one.gateway)} ${Math.round(one.load * 100)} %`).join(" · ")));
+  const stands = all.filter((one) => one.stand).map((one) => said(one.stand));
+  sum("fleet-faults", counted(all.flatMap((one) => Object.keys(one.faults ?? {}))), (list) => t("Faults: {list}", { list }));
+  sum("fleet-versions", counted(all.filter((one) => one.version).map((one) => one.version)), (list) => t("Versions: {list}", { list }));
+  sum("fleet-standby", counted(stands), (list) => t("Standby groups: {list}", { list }));
+  sum("fleet-load", busy.map((one) => [short(one.gateway), `${Math.round(one.load * 100)} %`]), (list) => t("Busiest: {list}", { list }));
   keyed(byId("fleet-list"), found.slice(0, MOST_ROWS), (one) => one.gateway, makeRow, showRow);
   const left = found.length - MOST_ROWS;
-  byId("fleet-more").left = left > 0 ? `and ${left} more: find them by words` : found.length ? "" : "None.";
+  byId("fleet-more").left = left > 0 ? t("and {n} more: use the search", { n: left }) : found.length ? "" : t("None.");
 }
 
-const sum = (title, found) => (found ? `${title}: ${found}` : "");
-const text = (one) => [one.gateway, one.says, one.version, one.stand, ...Object.keys(one.faults ?? {})].join(" ").toLowerCase();
+const sum = (id, pairs, shown) => put(id, pairs.length ? shown(pairs.map((pair) => pair.join(" ")).join(" · ")) : "");
+const says = (one) => one.says.replace(/\d{4}-\d\d-\d\dT[\d:]+Z/, (time) => moment(Date.parse(time))).split("; ").map(said).join("; ");
+const text = (one) => [one.gateway, says(one), one.version, one.stand, ...Object.keys(one.faults ?? {})].join(" ").toLowerCase();
 
 function makeState(state) {
   return h("button", { type: "button", className: state, onclick: () => { only = only === state ? "" : state; show(); } });
@@ -101,9 +106,9 @@ function showCell(cell, one, chosen) {
   const link = cell.firstElementChild;
   style(cell, `${one.state}${chosen ? "" : " other"}`);
   put(link, SIGNS[one.state] + (all.length > 60 ? "" : ` ${short(one.gateway)}`));
-  const says = `${short(one.gateway)}: ${STATES[one.state]}${one.says ? `, ${one.says}` : ""}`;
-  link.title = says;
-  link.setAttribute("aria-label", says);
+  const about = `${short(one.gateway)}: ${listed([STATES[one.state], says(one)])}`;
+  link.title = about;
+  link.setAttribute("aria-label", about);
 }
 
 function makeRow() {
@@ -120,9 +125,9 @@ function showRow(row, one) {
   put(row.state, STATES[one.state]);
   style(row.state, `pill ${one.state}`);
   put(row.name, short(one.gateway));
-  put(row.says, one.says.replace(/\d{4}-\d\d-\d\dT[\d:]+Z/, (time) => moment(Date.parse(time))));
-  const devices = Object.entries(one.devices ?? {}).map(([standing, number]) => `${number} ${standing}`).join(", ");
-  const facts = one.version && [`version ${one.version}`, `up ${span(one.up)}`, `${one.tags} tags`, devices, one.load !== null && `load ${Math.round(one.load * 100)} %`, one.stand];
+  put(row.says, says(one));
+  const devices = Object.entries(one.devices ?? {}).map(([standing, number]) => `${number} ${said(standing)}`);
+  const facts = one.version && [t("version {version}", one), t("up {span}", { span: span(one.up) }), several(one.tags, "{n} tag", "{n} tags"), listed(devices), one.load !== null && t("load {n}", { n: `${Math.round(one.load * 100)} %` }), said(one.stand)];
   put(row.facts, (facts || []).filter(Boolean).join(" · "));
 }
 
