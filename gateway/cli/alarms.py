@@ -148,7 +148,7 @@ def _acknowledge_all(
 
 def _order(client: Client, alarm: str, fields: dict[str, object], *, as_json: bool) -> str:
     """Sends an order, and prints its answer. Returns the error word; empty: it is done."""
-    answer = client.order(f"alarms/{alarm}", fields)
+    answer = client.requests.order(f"alarms/{alarm}", fields)
     if as_json:
         print(json.dumps(answer))
     if "error" in answer:

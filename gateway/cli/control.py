@@ -28,7 +28,7 @@ def control(
         print(direct.run(direct.control(loaded, device, command, argument)).answer)
         return
     with connected(loaded, err.print) as client:
-        answer = client.control(line_of(loaded, device).name, device, command, argument)
+        answer = client.requests.control(line_of(loaded, device).name, device, command, argument)
     if "error" in answer:
         end(outcome(device, answer), error_code(answer))
     print(printable(str(answer["answer"])))

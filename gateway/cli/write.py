@@ -118,10 +118,11 @@ def _write(
     is_group = target not in {tag.key for tag in values}
     if not directly:
         with connected(config, err.print) as client:
-            if is_group:
-                return client.write(target, {tag.name: value for tag, value in values.items()})
-            [value] = values.values()
-            return client.write(target, value)
+            if not is_group:
+                [value] = values.values()
+                return client.requests.write(target, value)
+            by_name = {tag.name: value for tag, value in values.items()}
+            return client.requests.write(target, by_name)
     from gateway.cli.line import direct
 
     started = time.monotonic()

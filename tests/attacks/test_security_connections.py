@@ -119,7 +119,7 @@ def reads_and_does_not_write(path: Path) -> None:
     with connected(load(path), print) as own:
         assert len(own.values("**")) == VALUES
         with pytest.raises(GatewayError, match="nothing was sent"):
-            own.write("mixer/recipe", 8)
+            own.requests.write("mixer/recipe", 8)
 
 
 async def test_by_name_and_password(tmp_path: Path) -> None:

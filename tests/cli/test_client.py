@@ -23,8 +23,8 @@ Answer = Callable[[zenoh.Query], None]
 Request = Callable[[Client], object]
 META = "plant/mixer/**/@meta"
 REQUESTS: list[Request] = [
-    lambda client: client.write("mixer/speed", 5),
-    lambda client: client.control("hall", "mixer", "stop", ""),
+    lambda client: client.requests.write("mixer/speed", 5),
+    lambda client: client.requests.control("hall", "mixer", "stop", ""),
 ]
 
 
@@ -430,7 +430,7 @@ def test_any_value_of_a_tag_can_be_sent(config: Config, value: Value) -> None:
 
     answers = {"plant/**/@set": echo, META: described}
     with answering(config, answers), connected(config, print) as client:
-        assert client.write("mixer/speed", value) == {"value": repr(value)}
+        assert client.requests.write("mixer/speed", value) == {"value": repr(value)}
 
 
 def test_of_a_block_only_wanted_tags_of_the_file_are_shown(tmp_path: Path) -> None:

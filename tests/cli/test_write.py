@@ -91,7 +91,7 @@ def test_a_gateway_that_hangs_does_not_get_the_write(
         with connected(load(path), print) as client:
             os.kill(program.pid, signal.SIGSTOP)
             with pytest.raises(GatewayError, match="nothing was sent"):
-                client.write("mixer/trim", 2)
+                client.requests.write("mixer/trim", 2)
         os.kill(program.pid, signal.SIGCONT)
         while (read := plc_gateway("read", path, "mixer/trim", "--json", "--max-age", "0s")).code:
             pass  # it goes on

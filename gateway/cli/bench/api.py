@@ -180,7 +180,7 @@ class BenchApi:
 
     async def _write(self, data: Mapping[str, Any]) -> object:
         tag, value = str(data["tag"]), parse_value(str(data["value"]))
-        return await self.running.ask(lambda client: client.write(tag, value))
+        return await self.running.ask(lambda client: client.requests.write(tag, value))
 
 
 def _chosen(data: Mapping[str, Any]) -> tuple[str, dict[str, str]]:

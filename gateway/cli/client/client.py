@@ -1,9 +1,8 @@
-"""The client of a running gateway: reads, writes, follows."""
+"""The client of a running gateway: reads and follows."""
 
-import json
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -20,13 +19,13 @@ from gateway.config.gateway_address import GatewayAddress
 from gateway.contract.keys import Keys
 from gateway.errors import GatewayError
 from gateway.northbound.session.everywhere import everywhere
-from gateway.values import Value
 
 if TYPE_CHECKING:
+    from gateway.cli.client.requests import Requests
     from gateway.config import Config
 
 REPLY_TIMEOUT = 10.0  # seconds
-_CHANGED = "does the gateway run with the current version of this file?"
+CHANGED = "does the gateway run with the current version of this file?"
 _LONGEST_LIST = 10  # tags in one sentence
 
 
@@ -49,12 +48,19 @@ class Client:
         self._has_standby = config.standby is not None
         self._tags = tags_by_key(config)
         self._only_blocks = [device for device in config.devices if device.blocks == "only"]
-        # Seconds that a request may wait for a telephone call.
         self._dialling = config.dialling
         self._tell = tell
         self._user = user
         self._duplicated: set[str] = set()  # devices of several gateways, reported once
         self._will_query = False  # because a device went online or offline
+
+    @cached_property
+    def requests(self) -> "Requests":
+        """Writes, commands and orders to this gateway."""
+        from gateway.cli.client.requests import Requests  # with signatures, and all about tags
+
+        known = self._session, self._keys, self._tags, self._dialling
+        return Requests(*known, self._query, self._user)
 
     @property
     def no_reply(self) -> str:
@@ -86,7 +92,7 @@ class Client:
         if missing:
             rest = len(missing) - _LONGEST_LIST
             more = f" and {rest} more" if rest > 0 else ""
-            self._tell(f"no reply for {', '.join(missing[:_LONGEST_LIST])}{more}: {_CHANGED}")
+            self._tell(f"no reply for {', '.join(missing[:_LONGEST_LIST])}{more}: {CHANGED}")
         return not missing
 
     def status(self, path: str = "status") -> dict[str, object]:
@@ -143,52 +149,11 @@ class Client:
         found = [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
         return sorted(found, key=lambda row: str(row["since"]))
 
-    def order(self, path: str, order: Mapping[str, object]) -> dict[str, object]:
-        """Returns the document of `alarms/<alarm>` or `doors/<door>` then, or `error ...`. Raises
-        as `write`."""
-        status = self._keys.status("status")
-        return self._request(self._keys.status(path), json.dumps(order).encode(), status)
-
     def trace(self, line: str, until: float | None) -> Iterator[dict[str, Any]]:
         """Yields the trace of a line, in parts. Raises `GatewayError` if nobody serves it."""
         session, keys = self._session, self._keys
         served = partial(self.status, f"lines/{line}")
         return traced(session, keys, line, until, served, self._tell)
-
-    def write(self, tag: str, value: Value | dict[str, Value]) -> dict[str, object]:
-        """Returns the outcome as the gateway sends it: `value ...` or `error ...`.
-
-        `tag`: also a device, with the values by tag. The outcome of each is in `tags`.
-
-        Raises `GatewayError` when no gateway accepts the write, or none replies.
-        """
-        # Not orjson: it refuses integers beyond 64 bits, which a float tag accepts.
-        device = tag.partition("/")[0]
-        data, dialling = json.dumps(value).encode(), self._dialling.get(device, 0.0)
-        return self._request(self._keys.set(tag), data, self._tags_of(device), dialling)
-
-    def control(self, line: str, device: str, command: str, argument: str) -> dict[str, object]:
-        """Returns the outcome of a command: `answer ...` or `error ...`. Raises as `write`."""
-        from gateway.config.commands import TO_ALL  # it knows the protocols, which take 0.1 s
-
-        if command == TO_ALL:
-            status = self._keys.status("status")
-            return self._request(self._keys.to_all(line), argument.encode(), status)
-        key = self._keys.command(device, command)
-        dialling = self._dialling.get(device, 0.0)
-        return self._request(key, argument.encode(), self._tags_of(device), dialling)
-
-    def peek(self, device: str, text: str) -> dict[str, object]:
-        """Returns `address`, `units` and `time`, or `error ...`. Raises as `write`."""
-        key, dialling = self._keys.peek(device), self._dialling.get(device, 0.0)
-        return self._request(key, text.encode(), self._tags_of(device), dialling)
-
-    def _tags_of(self, device: str) -> str:
-        """One description of a device, or its state where it has no tag: only its gateway
-        replies."""
-        if not any(tag.device == device for tag in self._tags.values()):
-            return self._keys.status(f"devices/{device}")
-        return self._keys.meta(f"{device}/**") + "?page=1"
 
     def follow(self, wanted: list[str]) -> Generator[TagRow, None, None]:
         """Yields the current values, then every change, without end.
@@ -239,8 +204,7 @@ class Client:
         """Yields subscribers to the values, and to the blocks of devices without single values."""
 
         def arrived(sample: zenoh.Sample) -> None:
-            row = self._row(sample)
-            if row is not None:
+            if (row := self._row(sample)) is not None:
                 put(row)
 
         def unpacked(tags: dict[str, str], sample: zenoh.Sample) -> None:
@@ -257,10 +221,8 @@ class Client:
                 tag for tag in device.tags if not tag.publishing.event and matches(tag.key, wanted)
             ]
             if members:
-                yield self._session.declare_subscriber(
-                    self._keys.block(device.name),
-                    partial(unpacked, {tag.name: tag.key for tag in members}),
-                )
+                take = partial(unpacked, {tag.name: tag.key for tag in members})
+                yield self._session.declare_subscriber(self._keys.block(device.name), take)
 
     def _watchers(self, put: Callable[[bool], None]) -> tuple[AbstractContextManager[object], ...]:
         """Returns watchers of the gateway: they put True to query again, False when it is lost.
@@ -310,35 +272,6 @@ class Client:
             )
         except zenoh.ZError as error:
             raise GatewayError(f"{selector}: {error}") from None
-
-    def _request(
-        self, key: str, payload: bytes, documents: str, dialling: float = 0.0
-    ) -> dict[str, object]:
-        """Sends a write or a command if a gateway accepts it. Returns the decoded reply.
-
-        A query for `documents` comes first: only the gateway of the receiver replies to it. Every
-        gateway under the prefix gets the request, and is silent when the receiver is not its own.
-        A gateway that hangs does not get a request that it would execute later, after the client
-        has given up. And Zenoh keeps messages in order, so after the reply the session knows
-        whether a gateway may get the request.
-        """
-        from gateway.cli.client.signing import signature  # with all about tags
-
-        timeout = REPLY_TIMEOUT + dialling
-        # The reply has the priority of the query: before values and long answers.
-        urgent = zenoh.Priority.INTERACTIVE_HIGH
-        with self._session.declare_querier(key, timeout=timeout, priority=urgent) as querier:
-            served = any(reply.ok is not None for reply in self._query(documents))
-            matches = querier.matching_status
-            if not (served and matches.matching):  # type: ignore[attr-defined]  # not in the stub
-                may = f"may {self._user} do this, and " if self._user else ""
-                raise GatewayError(f"no gateway accepts {key}: nothing was sent; {may}{_CHANGED}")
-            for reply in querier.get(payload=payload, attachment=signature(key, payload)):
-                answer = reply.ok or reply.err
-                with suppress(orjson.JSONDecodeError):  # Zenoh's own `Timeout` is not JSON
-                    if answer is not None:
-                        return document(answer.payload.to_bytes())
-        raise GatewayError(f"{key}: no reply: it is unknown whether it was done")
 
     def _row(self, sample: zenoh.Sample) -> TagRow | None:
         tag = self._tags.get(self._keys.tag(str(sample.key_expr)) or "")

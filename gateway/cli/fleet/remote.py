@@ -80,7 +80,7 @@ def _order(
 
 
 def _sent(client: Client, order: dict[str, Any]) -> dict[str, Any]:
-    answer = client.order(_KEY, order)
+    answer = client.requests.order(_KEY, order)
     if "error" in answer:
         end(printable(str(answer["reason"])), FAILED)
     return answer

@@ -114,7 +114,7 @@ class Rollout:
 
     def _checked(self, name: str) -> Ended:
         try:
-            answer = self._client.of(name).order(KEY, self._steps[name].order)
+            answer = self._client.of(name).requests.order(KEY, self._steps[name].order)
         except GatewayError as error:
             return Ended(name, Result.UNREACHABLE, str(error))
         if "error" in answer:
@@ -162,7 +162,7 @@ class Rollout:
     ) -> RemoteDocument | tuple[Result, str]:
         """Returns the change that waits, or why none does."""
         try:
-            answer = one.order(KEY, {**step.order, "confirm": confirm})
+            answer = one.requests.order(KEY, {**step.order, "confirm": confirm})
             if "error" in answer:
                 return Result.REFUSED, str(answer["reason"])
             return read_remote(answer)
@@ -210,7 +210,7 @@ class Rollout:
         known."""
         while True:
             with suppress(GatewayError):
-                one.order(KEY, order)
+                one.requests.order(KEY, order)
             change = self._state(one)
             if change is not None and change["state"] != "waiting":
                 return change

@@ -110,7 +110,7 @@ def _gateway(config: Path | None) -> Iterator[Client | None]:
 def asked(client: Client, view: "View", text: str) -> list[Sample]:
     """Returns what the gateway reads now. Raises `GatewayError`."""
     device = view.tags[0].device
-    answer = client.peek(device, text)
+    answer = client.requests.peek(device, text)
     units = answer.get("units")
     if not isinstance(units, list) or len(units) != len(view.tags):
         raise GatewayError(f"{device}: {answer.get('reason') or answer.get('error') or answer}")

@@ -51,7 +51,7 @@ def _release(client: Client, name: str, doors: dict[str, Any]) -> None:
     if not alone:
         raise GatewayError(f"no program has the wire of {name} alone")
     for door in alone:
-        answer = client.order(f"doors/{door}", {"do": "release"})
+        answer = client.requests.order(f"doors/{door}", {"do": "release"})
         if "error" in answer:
             end(printable(f"{answer['error']}: {answer['reason']}"), FAILED)
         who = ", ".join(program["address"] for program in doors[door]["programs"])
