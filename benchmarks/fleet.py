@@ -230,7 +230,7 @@ class Bench:
             text = file_of(number, 9003, BAD_STATION)
             name = key_of(number).replace("/@gateway/", "/")
             order = {"do": "apply", "file": text, "confirm": BACK_AFTER}
-            answer: Any = client.of(name).order("remote/file", order)
+            answer: Any = client.of(name).requests.order("remote/file", order)
             return name, datetime.fromisoformat(answer["until"]).timestamp()
 
         place = Place(PREFIX, [self.endpoint], None)
