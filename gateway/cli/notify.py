@@ -30,7 +30,7 @@ def notify(
     known = ways_of(settings)
     if unknown := [way for way in ways or () if way not in known]:
         raise ConfigError(f"no rule of notify uses {unknown[0]}: there are {', '.join(known)}")
-    test = message(loaded.zenoh.prefix, loaded.name, [TEST], time.time_ns())
+    test = message(loaded.zenoh.prefix, loaded.name, [TEST], time.time_ns(), settings.language)
 
     async def send() -> list[str]:
         failed = list[str]()

@@ -1,13 +1,15 @@
 """The telephone calls of a line with a modem: dials, serves the call, and hangs up."""
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
+from gateway.engine.device.records import CallState
 from gateway.engine.dial_schedule import NEVER, CallRules, DialSchedule
 from gateway.engine.effects import Effect
-from gateway.errors import CallEnded, LineDown
+from gateway.errors import Busy, CallEnded, LineDown
 from gateway.line.channel import Channel
 from gateway.line.rounds import ConnectionOpener
 from gateway.transport import (
@@ -31,6 +33,55 @@ class CallPort(Port, Protocol):
 
     async def hang_up(self) -> None:
         """Returns when the modem has hung up. Raises `LineDown`."""
+
+
+@runtime_checkable
+class Telephone(Protocol):
+    """The port of a modem, which dials telephones too."""
+
+    async def ring(self, number: str) -> None:
+        """Returns when it was dialled. Raises `CallEnded`, and `LineDown`."""
+
+
+MOST_RINGS = 8  # of one modem; beyond, `Busy`
+
+
+class Rings:
+    """Telephones that the modem dials between two calls, because of an alarm."""
+
+    def __init__(self) -> None:
+        self._waiting = deque[tuple[str, asyncio.Future[None]]]()
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def add(self, number: str) -> "asyncio.Future[None]":
+        if len(self._waiting) >= MOST_RINGS:
+            raise Busy(f"{MOST_RINGS} telephones are waiting for the modem already")
+        ended = asyncio.get_running_loop().create_future()
+        self._waiting.append((number, ended))
+        return ended
+
+    async def dial_first(self, port: Telephone) -> None:
+        """Dials the first one, unless its client has left. Raises `LineDown`."""
+        number, ended = self._waiting[0]
+        try:
+            if not ended.done():
+                await port.ring(number)
+        except CallEnded as error:
+            if not ended.done():
+                ended.set_exception(error)
+        else:
+            if not ended.done():
+                ended.set_result(None)
+        self._waiting.popleft()
+
+    def lose(self, why: str) -> None:
+        """Ends all of them: the modem is lost."""
+        while self._waiting:
+            _, ended = self._waiting.popleft()
+            if not ended.done():
+                ended.set_exception(LineDown(why))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +120,8 @@ def rules_of(opener: Callable[[Receiver], Awaitable[Port]]) -> CallRules | None:
 class CallingLine(Protocol):
     """The line that the calls serve."""
 
+    rings: Rings
+
     def catch_up(self, now: float) -> None:
         """Raises `LineDown` when the port of the modem is lost."""
 
@@ -89,9 +142,14 @@ async def serve_calls(line: CallingLine, port: CallPort, calls: DialSchedule) ->
     try:
         while True:
             line.catch_up(now())
+            if line.rings and isinstance(port, Telephone):
+                calls.dial(now())
+                await line.rings.dial_first(port)
+                calls.record.enter(CallState.IDLE, now())
             due = calls.due(now())
             if due > now():
-                await line.idle(due)
+                if not line.rings:
+                    await line.idle(due)
                 continue
             await _call(line, port, calls, now)
     except LineDown as error:

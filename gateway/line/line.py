@@ -20,7 +20,7 @@ from gateway.engine.engine import Engine
 from gateway.engine.jobs.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
 from gateway.engine.jobs.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
 from gateway.errors import CallEnded, GatewayError, Lent, LineDown
-from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
+from gateway.line.calling import CallPort, Rings, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Alarm, Channel, channels
 from gateway.line.opening import REOPEN_LONGEST, Loan, OpenPort, Pauses, own, pause
@@ -66,6 +66,7 @@ class Line:
         self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
         self.calls: DialSchedule | None = None  # while a modem is there
+        self.rings = Rings()
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
         self._lost: LineDown | None = None
@@ -116,6 +117,14 @@ class Line:
     ) -> asyncio.Future[str]:
         """Sends a command of the driver, such as run or stop. As `write`."""
         return self._submit(Command(device, name, argument, _now(), within))
+
+    async def ring(self, number: str) -> None:
+        """Dials a telephone, between two calls. Raises `LineDown` in the words of the modem."""
+        if self.calls is None:
+            raise LineDown(f"line {self.name}: its modem is not there")
+        ended = self.rings.add(number)
+        self._wake.set()
+        await ended
 
     def peek(self, device: Device, span: Span, within: float = WRITE_EXPIRY) -> asyncio.Future[str]:
         """Reads any addresses once. The future has the units, with spaces between. As `write`."""
@@ -289,6 +298,7 @@ class Line:
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
         self._transaction = self.calls = None
+        self.rings.lose(f"line {self.name}: its modem was lost")
         self.engine.reach_by_modem(False)
         self._alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:

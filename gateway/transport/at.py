@@ -18,6 +18,7 @@ from gateway.transport.modem_events import (
     Send,
     SetDtr,
     State,
+    dial_command,
 )
 
 NEVER = float("inf")
@@ -39,6 +40,7 @@ _LINE_END = re.compile(rb"[\r\n]")
 _MOST_KEPT = 256  # bytes of one line of the modem
 _AFTER = (SETUP, KEEP_SILENT)  # after the init strings, which may change them
 MOST_ESCAPES = 2  # in one hang-up
+CALLING = (State.ONLINE, State.DIALLING, State.RINGING, State.ANSWERING, State.ABORTING)
 
 
 class AtModem:
@@ -72,20 +74,30 @@ class AtModem:
 
     def dial(self, now: float) -> list[Event]:
         """Dials the number. `Connected` or `Failed` follows."""
-        if self.state is not State.READY:
-            self._events.append(Failed("the modem is not ready"))
-        elif now < self._rang + RING_TIME:  # ATD would take that call
-            self._events.append(Failed("RING: an incoming call"))
+        if why := self._why_no_dial(now):
+            self._events.append(Failed(why))
         else:
-            command, timeout = self._settings.dial_command, self._settings.dial_timeout
+            command, timeout = dial_command(self._settings.number), self._settings.dial_timeout
             self._command(command, State.DIALLING, now + timeout)
+        return self._taken()
+
+    def ring(self, number: str, now: float) -> list[Event]:
+        """Dials a telephone, and hangs up. `Ready` or `Failed` follows.
+
+        `;` behind the number: the modem says OK when it has dialled, and waits for no carrier.
+        """
+        if why := self._why_no_dial(now):
+            self._events.append(Failed(why))
+        else:
+            command = f"{dial_command(number)};"
+            self._command(command, State.RINGING, now + self._settings.dial_timeout)
         return self._taken()
 
     def hang_up(self, now: float) -> list[Event]:
         """Ends the call, or the dial. `Ready` or `Broken` follows."""
         if self.state is State.READY:
             self._events.append(Ready())
-        elif self.state in (State.ONLINE, State.DIALLING, State.ANSWERING, State.ABORTING):
+        elif self.state in CALLING:
             self._begin_hang_up(Ready(), now)
         return self._taken()
 
@@ -94,6 +106,11 @@ class AtModem:
         if self.state is State.ONLINE:
             self._lost("NO CARRIER (the signal CD is off)")
         return self._taken()
+
+    def _why_no_dial(self, now: float) -> str:
+        if self.state is not State.READY:
+            return "the modem is not ready"
+        return "RING: an incoming call" if now < self._rang + RING_TIME else ""  # ATD would take it
 
     # Bytes and time
 
@@ -120,7 +137,7 @@ class AtModem:
         self.due = NEVER
         if self.state in (State.WAKING, State.PAUSING, State.STARTING):
             self._tick_setup(now)
-        elif self.state in (State.DIALLING, State.ANSWERING, State.ABORTING, State.ONLINE):
+        elif self.state in CALLING:
             self._tick_call(now)
         else:
             self._tick_hang_up(now)
@@ -143,8 +160,9 @@ class AtModem:
             case State.ABORTING:
                 self._begin_hang_up(self._then, now)
             case state:
-                why = f"no carrier within {self._settings.dial_timeout:g} s"
-                self._then = Failed(why) if state is State.DIALLING else Ready()
+                what = "OK" if state is State.RINGING else "carrier"
+                why = f"no {what} within {self._settings.dial_timeout:g} s"
+                self._then = Ready() if state is State.ANSWERING else Failed(why)
                 self._events.append(Send(b"\r"))  # any character breaks off the dial
                 self.state, self.due = State.ABORTING, now + ABORT_WAIT
 
@@ -196,6 +214,8 @@ class AtModem:
                 self._connected(text, now)
             case State.READY:  # it took a call by itself: a number would go to a stranger as data
                 self._begin_hang_up(Ready(), now)
+            case State.RINGING:  # a modem has answered
+                self._begin_hang_up(Ready(), now)
             case State.ABORTING:
                 self._begin_hang_up(self._then, now)
 
@@ -206,6 +226,9 @@ class AtModem:
             case State.STARTING:
                 self._commands.pop(0)
                 self._next_command(now)
+            case State.RINGING:
+                self._then, self._escapes = Ready(), 0
+                self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
             case State.ABORTING | State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
             case State.HANGING_UP | State.CARRIER_GONE:
@@ -218,7 +241,7 @@ class AtModem:
                 self._next_command(now)
             case State.STARTING:
                 self._break(f"answers {text} to {self._place}")
-            case State.DIALLING:
+            case State.DIALLING | State.RINGING:
                 self._events.append(Failed(text))
                 self._rest()
             case State.ANSWERING:  # the caller hung up

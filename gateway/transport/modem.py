@@ -9,7 +9,7 @@ import serialx
 import structlog
 
 from gateway.errors import CallEnded, LineDown
-from gateway.transport.at import NEVER, AtModem
+from gateway.transport.at import CALLING, NEVER, AtModem
 from gateway.transport.modem_events import (
     Broken,
     Connected,
@@ -109,6 +109,11 @@ class ModemPort:
             self._carrier = await self._signals.carrier()
         await self._ended(self._modem.dial)
 
+    async def ring(self, number: str) -> None:
+        """Dials a telephone, which has no carrier. Returns when it was dialled, and the modem has
+        hung up. Raises `CallEnded` in the words of the modem."""
+        await self._ended(lambda now: self._modem.ring(number, now))
+
     async def hang_up(self) -> None:
         """Returns when the modem has hung up. Raises `LineDown` if it does not."""
         await self._ended(self._modem.hang_up)
@@ -121,7 +126,7 @@ class ModemPort:
 
     async def close(self) -> None:
         """Closes the port of the modem: DTR falls, and the call with it. Else hangs up first."""
-        calling = self._modem.state in (State.ONLINE, State.DIALLING, State.ANSWERING)
+        calling = self._modem.state in CALLING
         if calling and not self._modem.dtr and self._loss is None:
             with suppress(LineDown, TimeoutError):
                 async with asyncio.timeout(2 * self.modem.guard + LONGEST_ANSWER):

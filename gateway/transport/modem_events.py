@@ -18,11 +18,11 @@ class ModemSettings:
     command_timeout: float = 5.0
     hold: float = 0.1  # the longest time of the text NO CARRIER on the wire
 
-    @property
-    def dial_command(self) -> str:
-        """`ATDT` and the number, or `ATDP` where the number begins with P."""
-        tone = "" if self.number[:1] in ("T", "P") else "T"
-        return f"ATD{tone}{self.number}"
+
+def dial_command(number: str) -> str:
+    """Returns `ATDT` and the number, or `ATDP` where the number begins with P."""
+    tone = "" if number[:1] in ("T", "P") else "T"
+    return f"ATD{tone}{number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,7 @@ class State(Enum):
     STARTING = auto()  # an init string was sent
     READY = auto()
     DIALLING = auto()
+    RINGING = auto()  # it dials a telephone, which is no modem
     ABORTING = auto()  # a dial took too long and was broken off
     ANSWERING = auto()
     ONLINE = auto()

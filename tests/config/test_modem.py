@@ -7,6 +7,7 @@ import pytest
 
 from gateway.config import Config, ConfigErrors, built
 from gateway.transport import ModemAddress, SerialPath
+from gateway.transport.modem_events import dial_command
 
 PUMP = {"protocol": "vigor", "station": 1, "tags": {"level": {"address": "D100"}}}
 VR1 = {**PUMP, "accept": ["D100"]}
@@ -29,14 +30,14 @@ def test_the_defaults_are_those_of_b3_8() -> None:
     assert far.port == ModemAddress(SerialPath("/dev/ttyS0"))
     assert far.modem is not None
     assert (far.modem.dial_timeout, far.modem.tries) == (60, 3)
-    assert far.modem.dial_command == "ATDT0,26204393"
+    assert dial_command(far.modem.number) == "ATDT0,26204393"
     assert far.modem.init == ("ATZ",)
 
 
 def test_a_number_may_say_how_it_is_dialled() -> None:
     [far] = line({"number": "P2620 4393", "init": ["AT&F", "ATX3"]}).lines
     assert far.modem is not None
-    assert far.modem.dial_command == "ATDP26204393"
+    assert dial_command(far.modem.number) == "ATDP26204393"
     assert far.modem.init == ("AT&F", "ATX3")
 
 

@@ -10,8 +10,8 @@ from gateway.config.settings.setting_types import Interval, Parsed
 from gateway.errors import ConfigError
 
 # The rest are signs between digits; `,` is a pause and W a wait for the dial tone.
-_NUMBER_PATTERN = r"^[TPtp]?[0-9*#+ABCDWabcdw,!@ ()./-]*[0-9*#][0-9*#+ABCDWabcdw,!@ ()./-]*$"
-_NUMBER = re.compile(_NUMBER_PATTERN)
+NUMBER_PATTERN = r"^[TPtp]?[0-9*#+ABCDWabcdw,!@ ()./-]*[0-9*#][0-9*#+ABCDWabcdw,!@ ()./-]*$"
+_NUMBER = re.compile(NUMBER_PATTERN)
 _INIT_PATTERN = r"^[Aa][Tt][ -~]{0,78}$"
 _INIT = re.compile(_INIT_PATTERN)
 _LEFT_OUT = re.compile(r"[ ()./-]")
@@ -51,7 +51,7 @@ class ModemSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
 
     number: Annotated[
-        str | None, Parsed(phone_number, {"type": "string", "pattern": _NUMBER_PATTERN})
+        str | None, Parsed(phone_number, {"type": "string", "pattern": NUMBER_PATTERN})
     ] = None
     """The telephone number of the PLCs, in quotes; a modem that only answers has none."""
     init: Annotated[

@@ -2,8 +2,8 @@
 
 A catalogue is one JSON file: `page` and `bench` have the texts of the pages, `sentences` those of
 the gateway, each by its English words. `{name}` is a place. In a sentence the name says what may
-be there: `why…` another sentence, which is translated too, `names…` a list, `text…` anything, all
-others one word. `language.js` of the page does the same.
+be there: `why…` another sentence, which is translated too, `names…` a list, `text…` anything, `n`
+a number, all others one word. `language.js` of the page does the same.
 """
 
 import json
@@ -17,7 +17,7 @@ Language = Literal["en", "de", "ko", "zh-CN", "zh-TW"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 PLACE = re.compile(r"\{(\w+)\}")
 _FOLDER = Path(__file__).parent
-_KINDS = (("why", ".+"), ("text", ".+"), ("names", "[^:;]+"), ("", r"\S+"))
+_KINDS = (("(why|text).*", ".+"), ("names.*", "[^:;]+"), ("n", r"[-+\d.,]+"), (".*", r"\S+"))
 _TRANSLATED = ("why", "names")
 _CHINESE = {"tw": "zh-TW", "hk": "zh-TW", "mo": "zh-TW", "hant": "zh-TW"}
 Catalogue = Mapping[str, Any]
@@ -76,5 +76,5 @@ def _pattern(words: str) -> str:
 
 
 def _place(name: str) -> str:
-    kind = next(pattern for begin, pattern in _KINDS if name.startswith(begin))
+    kind = next(pattern for names, pattern in _KINDS if re.fullmatch(names, name))
     return f"?P<{name}>{kind}"

@@ -13,6 +13,7 @@ import orjson
 import structlog
 
 from gateway.contract.documents.catalogue import in_status
+from gateway.errors import LineDown
 from gateway.parts.notify.message import Message, message
 from gateway.parts.notify.outbox import NotifyDocument, Outbox
 from gateway.parts.notify.settings import NotifySection, rules_of
@@ -38,7 +39,8 @@ class NotifyPart:
 
     def __init__(self, core: Core, settings: NotifySection) -> None:
         self._core = core
-        self._ways = ways(settings)
+        self._ways = ways(settings, self._ring)
+        self._language = settings.language
         self._boxes = {way: Outbox(settings.keep) for way in self._ways}
         self._filled = {way: asyncio.Event() for way in self._ways}
         self._watches = [Watch(rule) for rule in rules_of(settings)]
@@ -104,11 +106,17 @@ class NotifyPart:
         config = self._core.config
         for watch in self._watches:
             if notices := watch.look(self._alarms, listed.one, now, clock):
-                new = message(config.zenoh.prefix, config.name, notices, wall)
+                new = message(config.zenoh.prefix, config.name, notices, wall, self._language)
                 for way in watch.rule.to:
                     self._boxes[way].put(new, now)
                     self._filled[way].set()
                 self._unsaved = True
+
+    async def _ring(self, line: str, number: str) -> None:
+        found = next((one for one in self._core.plant.lines if one.name == line), None)
+        if found is None:
+            raise LineDown(f"line {line} is not served now")
+        await found.ring(number)
 
     async def _send_all(self, way: str) -> None:
         box, again, loop = self._boxes[way], AGAIN_FIRST, asyncio.get_running_loop()

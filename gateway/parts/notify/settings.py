@@ -12,14 +12,16 @@ from pydantic import Field
 
 from gateway.config.messages import Mistakes, meant, shown
 from gateway.config.messages import Path as Setting
+from gateway.config.settings.modem_settings import NUMBER_PATTERN, phone_number
 from gateway.config.settings.sections import PartSection, Place, Written
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import Duration, FilePath, Interval, Parsed, Text
+from gateway.contract.languages import Language
 from gateway.errors import ConfigError
 from gateway.tags import Priority
 from gateway.transport.port import is_loopback
 
-WAYS = ("mail", "webhook", "mqtt", "command")
+WAYS = ("mail", "webhook", "mqtt", "command", "telephone")
 Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
 DAYS: tuple[Day, ...] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _MAIL_ADDRESS = re.compile(r"[\w.+-]+@[\w.-]+\Z", re.ASCII)
@@ -126,11 +128,21 @@ class MqttSection(Section):
     """The certificate authority of the broker, as a PEM file; left out: those of this machine."""
 
 
+class TelephoneSection(Section):
+    """A telephone or a pager, which the modem of a line dials between its calls."""
+
+    line: Text
+    """The line with the modem."""
+    number: Annotated[str, Parsed(phone_number, {"type": "string", "pattern": NUMBER_PATTERN})]
+    """The telephone number, in quotes; `,` is a pause of 2 s, also to let it ring or before a
+    code: "0,26204393,,,,911"."""
+
+
 class RuleSection(Section):
     """Which alarms reach whom. Each rule is applied by itself."""
 
     to: Annotated[list[Text], Field(min_length=1)]
-    """The ways: mail, webhook, mqtt, command; or a mail address, such as boss@plant.example."""
+    """The ways: mail, webhook, mqtt, command, telephone; or a mail address."""
     priority: Literal["critical", "high", "medium", "low"] = "low"
     """Alarms of this priority, and more urgent ones."""
     alarms: Annotated[list[Text], Field(min_length=1)] = ["*"]
@@ -160,6 +172,10 @@ class NotifySection(Section):
     """A message to a broker."""
     command: Annotated[list[Text], Field(min_length=1)] | None = None
     """A program and its arguments: it gets each message as JSON on its standard input."""
+    telephone: TelephoneSection | None = None
+    """A telephone that the modem of a line dials."""
+    language: Language = "en"
+    """The language of mails; documents stay English."""
     rules: Annotated[list[RuleSection], Field(min_length=1)]
     """Which alarms reach whom."""
     path: FilePath = Path("notify.json")
@@ -219,6 +235,12 @@ def _place(settings: NotifySection | None, place: Place) -> NotifySection | None
     for name in ("mail", "mqtt"):
         if (section := getattr(settings, name)) is not None:
             _check_server(name, section, place.mistakes)
+    if (telephone := settings.telephone) is not None:
+        dial = [line.name for line in place.lines if line.modem and line.modem.number]
+        if telephone.line not in dial:
+            why = f"is no line whose modem dials: {meant(telephone.line, dial)}"
+            at = ("notify", "telephone", "line")
+            place.mistakes.add(at, f"{shown(telephone.line)} {why}")
     files: dict[str, Any] = {"path": place.written(settings.path)}
     for name, setting, file in _files(settings):
         found = place.existing(file, "notify", name, setting)

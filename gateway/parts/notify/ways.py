@@ -1,7 +1,7 @@
-"""The ways to people: mail, webhook, MQTT, a command.
+"""The ways to people: mail, webhook, MQTT, a command, a telephone.
 
 Each sends one message, or raises a `GatewayError` that says why not. The caller ends a try that
-takes longer than `WITHIN`.
+takes longer than `WITHIN`, or `DIALLED_WITHIN`.
 """
 
 import asyncio
@@ -28,45 +28,67 @@ from gateway.parts.notify.message import Message
 from gateway.parts.notify.settings import (
     MqttSection,
     NotifySection,
+    TelephoneSection,
     WebhookSection,
 )
 from gateway.plant.threads import off_loop
 
 WITHIN = 30.0  # seconds for one try
 COMMAND_WITHIN = 25.0  # seconds
+DIALLED_WITHIN = 300.0  # seconds: the modem may be in a call of its line
 
 Send = Callable[[Message], Coroutine[Any, Any, None]]
+Ring = Callable[[str, str], Coroutine[Any, Any, None]]  # line and number
 
 
-def ways(settings: NotifySection) -> dict[str, Send]:
-    """Returns the ways that the rules use, by name. Each raises `GatewayError`."""
+def ways(settings: NotifySection, ring: Ring | None = None) -> dict[str, Send]:
+    """Returns the ways that the rules use, by name. Each raises `GatewayError`.
+
+    `ring` dials; None: another process has the modem.
+    """
     used = dict.fromkeys(way for rule in settings.rules for way in rule.to)
-    return {way: _way(way, settings) for way in used}
+    return {way: _way(way, settings, ring) for way in used}
 
 
 async def why_not_sent(send: Send, message: Message) -> str:
     """Tries to send a message. Returns why it was not sent; empty: it was."""
+    within = DIALLED_WITHIN if isinstance(send, _Telephone) else WITHIN
     try:
-        async with asyncio.timeout(WITHIN):
+        async with asyncio.timeout(within):
             await send(message)
     except TimeoutError:
-        return f"no answer within {WITHIN:g} s"
+        return f"no answer within {within:g} s"
     except GatewayError as error:
         return str(error)
     return ""
 
 
-def _way(way: str, settings: NotifySection) -> Send:
+def _way(way: str, settings: NotifySection, ring: Ring | None) -> Send:
     if way == "webhook" and settings.webhook is not None:
         return _Webhook(settings.webhook).send
     if way == "mqtt" and settings.mqtt is not None:
         return _Mqtt(settings.mqtt).send
     if way == "command" and settings.command is not None:
         return _Blocking(_Command(settings.command).send).send
+    if way == "telephone" and settings.telephone is not None:
+        return _Telephone(settings.telephone, ring)
     if settings.mail is None:
         raise ConfigError(f"notify: there is no {way}")
     to = settings.mail.to if way == "mail" else [way]
     return _Blocking(Mail(settings.mail, to).send).send
+
+
+class _Telephone:
+    """The message is the ring, or the code behind the number."""
+
+    def __init__(self, settings: TelephoneSection, ring: Ring | None) -> None:
+        self._settings = settings
+        self._ring = ring
+
+    async def __call__(self, _message: Message) -> None:
+        if self._ring is None:
+            raise GatewayError("only the gateway that runs dials: its line has the modem")
+        await self._ring(self._settings.line, self._settings.number)
 
 
 class _Blocking:

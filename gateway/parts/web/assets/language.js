@@ -24,7 +24,7 @@ export const dates = locale === "en" ? [] : locale;
 // -- sentences of the gateway --
 
 // As `gateway.contract.translation`, where the kinds of places are explained.
-const KINDS = [[/^(why|text)/, ".+"], [/^names/, "[^:;]+"], [/^/, "\\S+"]];
+const KINDS = [[/^(why|text)/, ".+"], [/^names/, "[^:;]+"], [/^n$/, "[-+\\d.,]+"], [/^/, "\\S+"]];
 const literal = (text) => text.replace(PLACE, "").length;
 const patterns = Object.entries(catalogue.sentences).sort(([one], [other]) => literal(other) - literal(one)).map(([from, to]) => {
   const parts = from.split(PLACE); // text and names in turn
