@@ -69,8 +69,8 @@ def test_a_gateway_enrols_with_the_code_that_a_person_carries(
     command: Command, tmp_path: Path
 ) -> None:
     pki, at = tmp_path / "pki", f"127.0.0.1:{free_port()}"
-    command("ca", "create", pki)
-    with gateway("ca", "serve", pki, "--at", at) as program:
+    command("ca", "create", pki, "--at", at)
+    with gateway("ca", "serve", pki) as program:
         program.says("authority ready", at)
         code = command("ca", "invite", pki, "hall", "gateway.plant").out.strip()
         done = command("enrol", code, "--folder", tmp_path / "own")

@@ -17,8 +17,9 @@ from gateway.config.loading import dumped
 from gateway.contract.documents.fleet import ReportDocument
 from gateway.contract.fleet_rows import State, Told, Wanted, rows, told_by, wanted_in
 from tests.cli.conftest import Command
-from tests.e2e.processes import free_port, plc_gateway, started, write_config
-from tests.zenoh_peer import free_endpoint
+from tests.e2e.processes import free_port, plc_gateway, started, until, write_config
+from tests.northbound.access import PASSWORDS, ROUTER_RULES, rules, users
+from tests.zenoh_peer import configured, free_endpoint
 
 REPORT: dict[str, Any] = {
     "contract": 1,
@@ -214,6 +215,38 @@ def test_the_page_of_a_gateway_has_those_that_reply_to_its_query(tmp_path: Path)
         }
         with urlopen(f"http://127.0.0.1:{port}/", timeout=60) as reply:
             assert b"fleet.js" in reply.read()
+
+
+def test_access_control_needs_the_key_of_the_reports(tmp_path: Path) -> None:
+    """As docs/fleet.md says."""
+    endpoint, key, access = free_endpoint(), "plant/**/@gateway/*/report", rules(ROUTER_RULES)
+    for rule in access["rules"]:
+        if rule["id"] in ("ask", "tell", "offer", "asked"):
+            rule["key_exprs"].append(key)
+    access["policies"].append({"rules": ["ask", "tell"], "subjects": ["gateways"]})
+    own = {"access_control": access, "transport/auth/usrpwd/dictionary_file": str(users(tmp_path))}
+
+    def opened(name: str, mode: str = "client", **more: Any) -> zenoh.Session:
+        user = {"user": name, "password": PASSWORDS[name]}
+        config = {f"transport/auth/usrpwd/{field}": value for field, value in user.items()}
+        setup: dict[str, Any] = {"mode": mode, "listen": [], "connect": [endpoint], **more}
+        return zenoh.open(configured(setup | {"config": config | setup.get("config", {})}))
+
+    with (
+        opened("gateway", "router", listen=[endpoint], connect=[], config=own),
+        opened("gateway") as gateway,
+        opened("viewer") as viewer,
+        opened("gateway") as page,
+    ):
+        replies = ["plant/@gateway/a/report", "plant/north/@gateway/b/report"]
+        kept = [gateway.declare_queryable(one, partial(_reply, one, b"{}")) for one in replies]
+        for asking in (viewer, page):
+            until(lambda who=asking: _found(who, key) == replies, "both replied")  # type: ignore[misc]
+        assert len(kept) == 2
+
+
+def _found(session: zenoh.Session, key: str) -> list[str]:
+    return sorted(str(one.ok.key_expr) for one in session.get(key, timeout=5) if one.ok)
 
 
 def test_a_folder_that_is_none(command: Command, tmp_path: Path) -> None:

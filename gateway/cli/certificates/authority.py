@@ -12,6 +12,7 @@ from gateway.cli.certificates import signing
 from gateway.cli.certificates.code import Code, new_secret
 from gateway.cli.certificates.signing import Holder, Pair
 from gateway.cli.certificates.state import Entry, Invitation, State, changing, keep, load, read
+from gateway.config.settings.parsers import web_address
 from gateway.contract.access.secrets import closed_to_others
 from gateway.errors import ConfigError, NotAllowed
 
@@ -23,8 +24,11 @@ _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}\Z")
 _TAKEN = {"ca", SERVER, "revoked", "authority"}  # names of files in the folder
 
 
-def create(folder: Path, days: int) -> Path:
-    """Makes an authority, and returns its certificate. Raises `ConfigError`."""
+def create(folder: Path, days: int, at: str = "") -> Path:
+    """Makes an authority, and returns its certificate. `at`: where gateways reach it; empty: that
+    is not known yet. Raises `GatewayError`."""
+    if at:
+        web_address(at)
     certificate, key = folder / "ca.pem", folder / "ca.key"
     if key.exists() or certificate.exists():
         raise ConfigError(f"{folder} has an authority: its certificates would end with it")
@@ -35,6 +39,9 @@ def create(folder: Path, days: int) -> Path:
     made = signing.new_authority(days)
     keep(key, signing.pem_of_key(made.key))
     keep(certificate, signing.pem(made.certificate))
+    if at:
+        with changing(folder) as state:
+            state.at = at
     return certificate
 
 

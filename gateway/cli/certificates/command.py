@@ -34,6 +34,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Of a gateway or a pro
 Addresses = Annotated[
     list[str], typer.Argument(metavar="[ADDRESS]...", help="Where clients reach the gateway.")
 ]
+At = Annotated[str, typer.Option(metavar="HOST:PORT", help="Where gateways reach it; kept.")]
 Client = Annotated[bool, typer.Option("--client", help="A program that only connects.")]
 
 
@@ -45,12 +46,13 @@ def commands() -> None:
 @cli.command()
 def create(
     folder: Folder,
+    at: At = "",
     days: Annotated[int, typer.Option(min=1, max=36_500, help="How long it is valid.")] = 3650,
 ) -> None:
     """Make an authority: a key that signs all certificates of the plant."""
     with _package():
         from gateway.cli.certificates.authority import create as made
-    out.print(str(made(folder, days)))
+    out.print(str(made(folder, days, at)))
 
 
 @cli.command()
@@ -69,9 +71,7 @@ def issue(
 @cli.command()
 def serve(
     folder: Folder,
-    at: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Where gateways reach it; kept.")
-    ] = "",
+    at: At = "",
     listen: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="Another address of this machine.")
     ] = "",
