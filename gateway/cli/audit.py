@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import ConfigPath
-from gateway.config import load
 from gateway.contract.past.timerange import LATEST, time_range
 from gateway.errors import GatewayError
 from gateway.parts.audit.file import checked, read
@@ -20,7 +20,7 @@ def audit(
     period: Annotated[str, typer.Option("--time", help="A range as in a query of Zenoh")] = "[..]",
 ) -> None:
     """Print the audit as lines of JSON, and check that no record was changed or taken out."""
-    path = load(config).audit_file
+    path = loaded(config).audit_file
     if path is None:
         raise GatewayError(f"{config} has no `audit:` below `gateway:`")
     asked = time_range(period, time.time_ns())

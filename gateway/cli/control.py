@@ -6,9 +6,9 @@ import typer
 
 from gateway.cli import completion
 from gateway.cli.client import connected
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import ConfigPath, Direct, end, err, printable
 from gateway.cli.write import error_code, outcome
-from gateway.config import load
 from gateway.config.commands import check_command, line_of
 
 
@@ -20,15 +20,15 @@ def control(
     without_gateway: Direct = False,
 ) -> None:
     """Run or stop a PLC, and other commands that the file allows by `control: true`."""
-    loaded = load(config)
-    check_command(loaded, device, command)
+    plant = loaded(config)
+    check_command(plant, device, command)
     if without_gateway:
         from gateway.cli.line import direct
 
-        print(direct.run(direct.control(loaded, device, command, argument)).answer)
+        print(direct.run(direct.control(plant, device, command, argument)).answer)
         return
-    with connected(loaded, err.print) as client:
-        answer = client.requests.control(line_of(loaded, device).name, device, command, argument)
+    with connected(plant, err.print) as client:
+        answer = client.requests.control(line_of(plant, device).name, device, command, argument)
     if "error" in answer:
         end(outcome(device, answer), error_code(answer))
     print(printable(str(answer["answer"])))

@@ -21,8 +21,9 @@ from rich.text import Text
 
 from gateway import __version__
 from gateway.cli.client import connected
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, out, printable
-from gateway.config import Config, LineConfig, load
+from gateway.config import Config, LineConfig
 from gateway.config.loading import written
 from gateway.config.messages import dotted
 from gateway.contract.faults import faults
@@ -60,7 +61,7 @@ class Finding(NamedTuple):
 
 def doctor(config: ConfigPath, as_json: AsJson = False) -> None:
     """Look at ports, rights, disk, clock, certificates and the running gateway of a file."""
-    found = list(findings(load(config), config))
+    found = list(findings(loaded(config), config))
     if as_json:
         for one in found:
             print(json.dumps(one._asdict()))

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
-from gateway.config import load
 from gateway.errors import ConfigError
 
 
@@ -24,13 +24,13 @@ def notify(
     from gateway.parts.notify.ways import ways as ways_of
     from gateway.parts.notify.ways import why_not_sent
 
-    loaded = load(config)
-    if (settings := loaded.part(NotifySection)) is None:
+    plant = loaded(config)
+    if (settings := plant.part(NotifySection)) is None:
         raise ConfigError(f"{config} has no section notify")
     known = ways_of(settings)
     if unknown := [way for way in ways or () if way not in known]:
         raise ConfigError(f"no rule of notify uses {unknown[0]}: there are {', '.join(known)}")
-    test = message(loaded.zenoh.prefix, loaded.name, [TEST], time.time_ns(), settings.language)
+    test = message(plant.zenoh.prefix, plant.name, [TEST], time.time_ns(), settings.language)
 
     async def send() -> list[str]:
         failed = list[str]()

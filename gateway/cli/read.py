@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from gateway.cli.client import connected, matches, tags_by_key, wanted_keys
+from gateway.cli.progress import loaded
 from gateway.cli.tables import is_good, print_rows, row_of
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, Direct, TagNames, Utc, err
-from gateway.config import load
 from gateway.contract.keys import max_age as parse_max_age
 from gateway.errors import GatewayError
 
@@ -24,8 +24,8 @@ def read(
     utc: Utc = False,
 ) -> None:
     """Print the current values, through the running gateway or --direct from the PLC."""
-    loaded = load(config)
-    wanted, by_key = wanted_keys(loaded, tags), tags_by_key(loaded)
+    plant = loaded(config)
+    wanted, by_key = wanted_keys(plant, tags), tags_by_key(plant)
     complete = True
     if max_age is not None:
         parse_max_age(max_age)  # reports a mistake even when no gateway runs
@@ -33,12 +33,12 @@ def read(
         from gateway.cli.line import direct
 
         chosen = [tag for key, tag in by_key.items() if matches(key, wanted)]
-        samples = direct.run(direct.read(loaded, chosen))
+        samples = direct.run(direct.read(plant, chosen))
         rows = [row_of(sample) for sample in samples]
         for failure in dict.fromkeys(f"{s.tag.device}: {s.detail}" for s in samples if s.detail):
             err.print(failure)
     else:
-        with connected(loaded, err.print) as client:
+        with connected(plant, err.print) as client:
             rows = [row for key in wanted for row in client.values(key, max_age)]
             if not rows:
                 raise GatewayError(client.no_reply)

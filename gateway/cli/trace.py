@@ -15,8 +15,9 @@ from gateway import files
 from gateway.cli import completion
 from gateway.cli.client import connected
 from gateway.cli.line.capture import Capture
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import AsJson, ConfigPath, err, printable
-from gateway.config import Config, LineConfig, load
+from gateway.config import Config, LineConfig
 from gateway.config.messages import meant
 from gateway.config.settings import parsers
 from gateway.errors import ConfigError, GatewayError
@@ -49,8 +50,8 @@ def trace(
     as_json: AsJson = False,
 ) -> None:
     """Print each exchange of a line, decoded, as it passes. Ctrl-C ends it."""
-    loaded = load(config)
-    found = line_named(loaded, line)
+    plant = loaded(config)
+    found = line_named(plant, line)
     if found.serve:
         raise ConfigError(
             f"{line} is a served line: only the lines that the gateway asks are traced"
@@ -58,7 +59,7 @@ def trace(
     size = parsers.size(keep)
     until = None if for_ is None else time.monotonic() + parsers.duration(for_)
     with ExitStack() as stack:
-        client = stack.enter_context(connected(loaded, err.print))
+        client = stack.enter_context(connected(plant, err.print))
         recording = None
         if record is not None:
             recording = stack.enter_context(Recording(record, line, size, notes(found)))

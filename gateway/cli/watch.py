@@ -9,9 +9,9 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.client import TagRow, connected, tags_by_key, wanted_keys
+from gateway.cli.progress import loaded
 from gateway.cli.tables import print_rows, table_of
 from gateway.cli.terminal import AsJson, ConfigPath, TagNames, Utc, err, out
-from gateway.config import load
 from gateway.tags import Tag
 
 
@@ -19,11 +19,11 @@ def watch(
     config: ConfigPath, tags: TagNames = None, as_json: AsJson = False, utc: Utc = False
 ) -> None:
     """Print a live table of values. Ctrl-C ends it."""
-    loaded = load(config)
-    wanted, by_key = wanted_keys(loaded, tags), tags_by_key(loaded)
+    plant = loaded(config)
+    wanted, by_key = wanted_keys(plant, tags), tags_by_key(plant)
     live = out.is_terminal and not as_json
     tell = out.print if live else err.print  # above the table
-    with connected(loaded, tell) as client, suppress(KeyboardInterrupt):
+    with connected(plant, tell) as client, suppress(KeyboardInterrupt):
         if live:
             show_live(out, client.follow(wanted), by_key, utc=utc)
         else:

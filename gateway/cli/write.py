@@ -12,9 +12,10 @@ import typer
 
 from gateway.cli import completion
 from gateway.cli.client import connected, parse_value, suggestion, tags_by_key
+from gateway.cli.progress import loaded
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
-from gateway.config import Config, load
+from gateway.config import Config
 from gateway.contract import payload
 from gateway.contract.problems import Problem
 from gateway.errors import BadValue, ConfigError, GatewayError
@@ -46,22 +47,22 @@ def write(
     as_json: AsJson = False,
 ) -> None:
     """Write one tag, or several tags of a device, and print the reply of the PLC."""
-    loaded = load(config)
-    known = tags_by_key(loaded)
-    if any(device.name == tag for device in loaded.devices):
+    plant = loaded(config)
+    known = tags_by_key(plant)
+    if any(device.name == tag for device in plant.devices):
         group = _group(config, known, tag, values)
-        answer = _write(loaded, tag, group, directly=without_gateway)
+        answer = _write(plant, tag, group, directly=without_gateway)
         lines = _group_lines(tag, answer)
     else:
         if len(values) > 1:
             raise ConfigError(f"{tag} takes one value; for several tags name their device")
         value = _value(config, known, tag, values[0])
-        answer = _write(loaded, tag, {known[tag]: value}, directly=without_gateway)
+        answer = _write(plant, tag, {known[tag]: value}, directly=without_gateway)
         lines = [(tag, answer)]
     if as_json:
         print(json.dumps(answer))
     else:
-        served = {one.name for one in loaded.devices if one.served}
+        served = {one.name for one in plant.devices if one.served}
         for key, end in lines:
             if "error" in end:
                 err.print(outcome(key, end), style="red")

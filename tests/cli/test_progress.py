@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gateway.cli.progress import AFTER, progress
+from gateway.cli.progress import AFTER, COUNTED, counted, progress
 from tests.e2e.processes import PATIENCE, ROOT
 
 PLANT = """\
@@ -117,3 +117,12 @@ def test_the_bar_says_what_is_done_and_how_much() -> None:
         while "50%" not in text.getvalue():  # a thread draws it
             time.sleep(0.01)
     assert "reading plant.yaml" in text.getvalue()
+
+
+def test_work_of_an_unknown_length_says_how_far_it_is() -> None:
+    console, text = _console(terminal=True)
+    with progress(console, 0.0) as report:
+        report("reading plant.yaml", 1.0)
+        assert list(counted(range(2 * COUNTED + 1), "rows exported", report))[-1] == 2 * COUNTED
+        while "2,000 rows exported" not in text.getvalue():  # a thread draws it
+            time.sleep(0.01)

@@ -12,6 +12,7 @@ import zenoh
 
 from gateway import config as configuration
 from gateway.cli.client.client import Client
+from gateway.cli.progress import busy
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.gateway_address import address
 from gateway.errors import ConfigError, GatewayError
@@ -61,7 +62,8 @@ def connected(config: "Config | GatewayAddress", tell: Callable[[str], None]) ->
     setup = _setup(config.zenoh, endpoints)
     user = json.loads(setup.get_json(_USER))
     try:
-        session = zenoh.open(setup)
+        with busy(f"connecting to {endpoints[0]}"):
+            session = zenoh.open(setup)
     except zenoh.ZError:
         from gateway.cli.client.diagnosis import connection_failure  # its TLS takes 10 ms
 

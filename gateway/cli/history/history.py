@@ -10,8 +10,9 @@ import typer
 
 from gateway.cli.client.arguments import matches, wanted_keys
 from gateway.cli.history.history_files import Column, new_file, write_csv, writer_of
+from gateway.cli.progress import busy, counted, loaded
 from gateway.cli.terminal import ConfigPath, TagNames, err
-from gateway.config import Config, load
+from gateway.config import Config
 from gateway.contract.past.buckets import Now
 from gateway.contract.past.history_query import HistoryQuery, question
 from gateway.contract.past.timerange import TimeRange, time_range
@@ -69,26 +70,30 @@ def export(
     ] = False,
 ) -> None:
     """Export samples of the history file. The gateway may run, or not."""
-    loaded = load(config)
+    plant = loaded(config)
     given = {"time": period, "bucket": bucket, "agg": agg, "quality": quality}
     asked = question({name: text for name, text in given.items() if text is not None}, "time")
     now = _wall()
     asked_period = time_range(asked.time_range, now)
-    found = _tags(loaded, tags)
+    found = _tags(plant, tags)
     columns = _SAMPLES if asked.bucket is None else _bucket_columns(asked)
-    path = history or _path(loaded, config)
+    path = history or _path(plant, config)
     with offline(path) as (search, course):
         lost: list[Damaged] = []
         if asked.bucket is None:
             rows = _samples(search, found, asked, asked_period, now, lost)
         else:
             rows = _buckets(course, found, asked, asked_period, now, lost)
-        if output is None:
+        if output is None and sys.stdout.isatty():
             write_csv(sys.stdout, columns, rows, comma=decimal_comma)
+        elif output is None:
+            with busy("reading") as report:
+                shown = counted(rows, "rows exported", report)
+                write_csv(sys.stdout, columns, shown, comma=decimal_comma)
         else:
             write = writer_of(output, columns, comma=decimal_comma)
-            with new_file(output) as unfinished:
-                count = write(unfinished, rows)
+            with busy("reading") as report, new_file(output) as unfinished:
+                count = write(unfinished, counted(rows, "rows exported", report))
             err.print(f"{output}: {count} rows of {path}")
         if lost:
             raise GatewayError(f"{path}: {lost[0]}; all others were exported")
@@ -97,15 +102,16 @@ def export(
 @cli.command()
 def salvage(config: ConfigPath) -> None:
     """Bring back the samples of a history that was moved aside. Stop the gateway first."""
-    path = _path(load(config), config).resolve()
-    back = salvaged(path)
+    path = _path(loaded(config), config).resolve()
+    with busy("bringing samples back") as report:
+        back = salvaged(path, lambda count: report(f"{count:,} samples are back", None))
     err.print(f"{path}: {back} samples are back; the old files are beside it")
 
 
 @cli.command()
 def known(config: ConfigPath) -> None:
     """End the fault of a history that was moved aside. The gateway may run, or not."""
-    path = _path(load(config), config).resolve()
+    path = _path(loaded(config), config).resolve()
     found = asides(path)
     if not found:
         raise GatewayError(f"no file beside {path} was moved aside")
@@ -121,8 +127,9 @@ def backup(
     copy: Annotated[Path, typer.Argument(metavar="COPY", help="A file that does not exist yet.")],
 ) -> None:
     """Copy the history to a file. The gateway may run: nothing waits for it."""
-    loaded = load(config)
-    size = copied(_path(loaded, config), copy)
+    plant = loaded(config)
+    with busy("copying the history"):
+        size = copied(_path(plant, config), copy)
     print(f"{copy}: {size / 1e6:.1f} MB")
 
 

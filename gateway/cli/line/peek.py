@@ -18,6 +18,7 @@ from gateway.cli.client import Client, connected
 from gateway.cli.line import direct
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.peek_table import Cell, change_text, table_of
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import FAILED, AsJson, end, err, out
 from gateway.config import Config, built, load
 from gateway.config.settings import parsers
@@ -99,9 +100,9 @@ def _gateway(config: Path | None) -> Iterator[Client | None]:
     """Yields a client of the running gateway; None where there is none, or no file."""
     with ExitStack() as stack:
         try:
-            found = (
-                None if config is None else stack.enter_context(connected(load(config), err.print))
-            )
+            found = None
+            if config is not None:
+                found = stack.enter_context(connected(loaded(config), err.print))
         except GatewayError:
             found = None
         yield found

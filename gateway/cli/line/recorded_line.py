@@ -5,8 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from gateway.cli.line.peek import given_settings
+from gateway.cli.progress import loaded
 from gateway.cli.trace import line_named
-from gateway.config import LineConfig, built, load
+from gateway.config import LineConfig, built
 from gateway.config.settings.validate import driver_settings
 from gateway.config.yaml.scalars import scalar
 from gateway.errors import ConfigError, GatewayError
@@ -72,7 +73,7 @@ class Log:
 
 def line_of_file(config: Path, log: Log) -> LineConfig:
     """Returns the line of the recording as the file describes it. Raises `ConfigError`."""
-    return line_named(load(config), log.line())
+    return line_named(loaded(config), log.line())
 
 
 def line_of_protocols(log: Log, protocols: Sequence[str], settings: Sequence[str]) -> LineConfig:

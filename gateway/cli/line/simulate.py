@@ -11,8 +11,9 @@ from typing import Annotated
 import typer
 
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import ConfigPath
-from gateway.config import Config, LineConfig, load
+from gateway.config import Config, LineConfig
 from gateway.errors import ConfigError
 from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.simulator.plant import station_for
@@ -31,9 +32,9 @@ def simulate(
     ] = None,
 ) -> None:
     """Serve the configured devices as simulated PLCs on ptys or TCP ports."""
-    loaded = load(config)
+    plant = loaded(config)
     set_up(LogFormat.TEXT, LogLevel.INFO)
-    asyncio.run(serve(loaded, tcp, links, partial(print, flush=True)))
+    asyncio.run(serve(plant, tcp, links, partial(print, flush=True)))
 
 
 async def serve(

@@ -11,8 +11,8 @@ import orjson
 import typer
 
 from gateway.cli.client import matches, wanted_keys
+from gateway.cli.progress import loaded
 from gateway.cli.terminal import ConfigPath, TagNames
-from gateway.config import load
 from gateway.config.sheets import neutral
 from gateway.config.transfers.ranges import is_range
 from gateway.contract.meta import meta_fields
@@ -39,12 +39,12 @@ def export(
     ] = False,
 ) -> None:
     """Export tags as a sheet: keys, types, units and limits, as `@meta` has them."""
-    loaded = load(config)
-    wanted = wanted_keys(loaded, tags)
-    ranges = {rule.source for rule in loaded.transfers if is_range(rule.text[0])}
+    plant = loaded(config)
+    wanted = wanted_keys(plant, tags)
+    ranges = {rule.source for rule in plant.transfers if is_range(rule.text[0])}
     rows = [
-        _row(loaded.zenoh.prefix, tag)
-        for device in loaded.devices
+        _row(plant.zenoh.prefix, tag)
+        for device in plant.devices
         for tag in device.tags
         if matches(tag.key, wanted) and tag.key not in ranges
     ]

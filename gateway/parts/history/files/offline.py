@@ -93,8 +93,12 @@ def _bounded() -> Callable[[int, int, int], None]:
     return check
 
 
-def salvage(path: Path, most_outcomes: int = 100_000) -> int:
+def salvage(
+    path: Path, report: Callable[[int], None] = lambda _count: None, most_outcomes: int = 100_000
+) -> int:
     """Returns how many samples were brought back. Raises `GatewayError`; then nothing has changed.
+
+    `report` gets the number of those of one file meanwhile.
 
     The new file has the samples of all files that were moved aside, and then those of the present
     history. The old files get another name.
@@ -111,9 +115,9 @@ def salvage(path: Path, most_outcomes: int = 100_000) -> int:
         _remove(made)
         with closing(HistoryFile(made, _SIZE)) as file:
             file.set_sync(full=False)
-            back = sum(_copy(one, file, most_outcomes) for one in found)
+            back = sum(_copy(one, file, report, most_outcomes) for one in found)
             if path.exists():
-                _copy(path, file, most_outcomes)
+                _copy(path, file, report, most_outcomes)
             file.set_sync(full=True)
             file.empty_log()
         for one in found:
@@ -130,7 +134,9 @@ def salvage(path: Path, most_outcomes: int = 100_000) -> int:
     return back
 
 
-def _copy(source: Path, file: HistoryFile, most_outcomes: int) -> int:
+def _copy(
+    source: Path, file: HistoryFile, report: Callable[[int], None], most_outcomes: int
+) -> int:
     count, begin = 0, file.next_number()
     for batch in aside.rows(source):
         number = file.next_number()
@@ -139,6 +145,7 @@ def _copy(source: Path, file: HistoryFile, most_outcomes: int) -> int:
             begin = number
         file.store_rows(number, batch)
         count += len(batch)
+        report(count)
     file.close_run(begin, file.next_number(), time.time_ns())
     for ring in Ring:
         if found := aside.outcomes(source, ring):
