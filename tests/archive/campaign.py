@@ -120,13 +120,15 @@ def campaign(store: str, kills: int, seed: int) -> int:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=200, help="half of them for each store")
+    parser.add_argument("--kills", type=int, default=200, help="shared by the stores")
+    parser.add_argument("--store", nargs="*", default=["parquet", "postgres"])
     parser.add_argument("--seed", type=int, default=int(time.time()))
     given = parser.parse_args()
-    for store in ("parquet", "postgres"):
+    kills = given.kills // len(given.store)
+    for store in given.store:
         print(f"{store}, seed {given.seed}", flush=True)
-        samples = campaign(store, given.kills // 2, given.seed)
-        print(f"{store}: {given.kills // 2} kills, {samples} samples, none lost, none double")
+        samples = campaign(store, kills, given.seed)
+        print(f"{store}: {kills} kills, {samples} samples, none lost, none double", flush=True)
 
 
 if __name__ == "__main__":
