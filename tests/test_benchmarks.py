@@ -21,6 +21,15 @@ TINY = [
         [r"^20 tags: known after [\d.]+ s, all watched", r"^[\d,]+ changes/s offered: .* 0 lost"],
     ),
     (
+        "archive",
+        "--samples 2000 --gateways 8 --history 2000 --seconds 1 --store parquet",
+        [
+            r"^before the back-fill: \d+ live values, late by p50 \d+ ms, p99 \d+ ms$",
+            r"^back-fill: 2000 samples, [\d,]+ a second$",
+            r"^  daily means of the tags of one gateway: \d+ rows in [\d.]+ s$",
+        ],
+    ),
+    (
         "bus_use",
         "--seconds 0.3 --protocols vigor --bauds 115200",
         [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],

@@ -13,6 +13,7 @@ from typing import Any
 import duckdb
 import pytest
 
+from gateway.archive.store import store_at
 from tests.e2e.processes import (
     Program,
     gateway,
@@ -56,10 +57,14 @@ def archived(store: Path) -> Found:
     )
 
 
-def status(store: object) -> dict[str, dict[str, Any]]:
-    done = plc_gateway("archive", "status", store, "--json")
-    rows = map(json.loads, done.out.splitlines())
-    return {row["gateway"].rpartition("/")[2]: row for row in rows}
+def samples(store: object) -> dict[str, int]:
+    """Returns the number of samples of each gateway, by its cursor."""
+    opened = store_at(str(store))
+    try:
+        found = opened.cursors()
+    finally:
+        opened.close()
+    return {key.rpartition("/")[2]: cursor.samples for key, cursor in found.items()}
 
 
 class Hall:
@@ -107,20 +112,20 @@ def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(tmp_path
         first.says("plant/@gateway/other: archived after the beginning")
         second = ends.enter_context(archiver(store, endpoint))
         second.says("another archiver of this store is at work: this one waits")
-        until(lambda: len(status(store)) == 2, "both gateways are archived")
+        until(lambda: samples(store).keys() == {"demo", "other"}, "both gateways are archived")
         first.end(signal.SIGKILL)
         second.says("this archiver is at work")
-        before = status(store)
-        until(lambda: status(store)["demo"]["samples"] > before["demo"]["samples"], "it goes on")
+        before = samples(store)["demo"]
+        until(lambda: samples(store)["demo"] > before, "it goes on")
         second.end(signal.SIGKILL)
 
     with demo.run(idle=True), other.run(idle=True), archiver(store, endpoint) as third:
         until(have_all(store, [demo, other]), "each sample is there once")
         assert third.end() == 0
-    now = status(store)
-    assert now["demo"]["samples"] == recorded(demo.history, "demo").total()
-    assert now["demo"]["gaps"] == []
-    assert float(now["demo"]["behind"]) < 3600
+    [row, _] = map(json.loads, plc_gateway("archive", "status", store, "--json").out.splitlines())
+    assert row["samples"] == recorded(demo.history, "demo").total()
+    assert (row["gateway"], row["gaps"]) == ("plant/@gateway/demo", [])
+    assert row["behind"] < 3600
 
     aside = demo.history.rename(f"{demo.history}.aside-20261126T120000Z")
     with demo.run(), archiver(store, endpoint) as fourth:

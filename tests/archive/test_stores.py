@@ -2,6 +2,7 @@
 
 import json
 import random
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from gateway.errors import ConfigError
 from tests.archive.servers import Postgres, postgres
 from tests.bridges.conftest import influxd as influxd
 from tests.bridges.test_influx import Influx, failing_server
+from tests.e2e.processes import ROOT
 
 DEMO = "plant/@gateway/demo"
 NOON = 1_795_694_400_000_000  # 2026-11-26T12:00:00Z
@@ -293,3 +295,31 @@ def test_what_is_no_sample_has_no_row() -> None:
     known = document_of(meta, True, b"12\0", about)
     assert known is not None
     assert row_of("plant/mixer/t", known)[:4] == (NOON, "plant/mixer/t", None, "12\ufffd")
+
+
+@pytest.mark.parametrize("place", ["postgres", "parquet"])
+def test_the_queries_of_the_page_work(
+    place: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    text = (ROOT / "docs" / "archive.md").read_text("utf-8")
+    [query] = [
+        block
+        for block in re.findall(r"```sql\n(.*?)```", text, re.DOTALL)
+        if ("read_parquet" in block) == (place == "parquet")
+    ]
+    begun = Cursor(DEMO)
+    rows = [row._replace(key="plant/mixer/speed") for row in page(7200)]
+    if place == "postgres":
+        database: Postgres = request.getfixturevalue("database")
+        store: Store = PostgresStore(database.address)
+        store.add(rows, begun, after(begun, "1"))
+        found = database.rows(query)
+    else:
+        store = ParquetStore(str(tmp_path))
+        store.add(rows, begun, after(begun, "1"))
+        found = duckdb.execute(query.replace("/srv/archive", str(tmp_path))).fetchall()
+    store.close()
+    assert [tuple(row)[1:] for row in found] == [
+        ("plant/mixer/speed", 224.9375, 0.0, 449.875),
+        ("plant/mixer/speed", 674.9375, 450.0, 899.875),
+    ]

@@ -145,3 +145,21 @@ async def test_a_client_that_reads_slowly_behind_large_buffers_gets_all(tmp_path
         replies = await client.get("plant/**?_time=[..]", timeout=90, consolidation="NONE")
         assert len(shown(replies)) == RUNS * many
         assert link.connections == 1
+
+
+async def test_what_was_deleted_before_it_was_read_is_told(tmp_path: Path) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "h.db"
+    recorded(path)
+    begin = "plant/@gateway/demo/page?_time=[..];page=70"
+    async with serving(tmp_path, endpoint), ZenohPeer("client", connect=[endpoint]) as client:
+        first, end = await page(client, begin)
+        assert first == [f"{TAGS[n % 20].key} {n}" for n in range(70)]
+        assert "again" not in end
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.drop(file.closed_runs(NOON, 0)[0])
+    async with serving(tmp_path, endpoint), ZenohPeer("client", connect=[endpoint]) as client:
+        found, end = await page(client, f"{begin};after={end['next']}")
+        assert end["damaged"] == f"{IN_RUN - 70} samples were deleted unread"
+        assert found[0] == f"{TAGS[0].key} {IN_RUN}"
+        found, end = await page(client, f"{begin};after={end['next']}")
+        assert "damaged" not in end
