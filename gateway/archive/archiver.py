@@ -62,7 +62,8 @@ class Follower:
             except Overtaken:
                 raise
             except GatewayError as error:
-                self._say(str(error))
+                if not isinstance(error, StoreDown):  # the same for all gateways
+                    self._say(str(error))
                 wait, pause = pause, min(2 * pause, LONGEST_PAUSE)
             else:
                 self._say(None)
@@ -125,6 +126,7 @@ class Archiver:
         self._gateways: set[str] = set()
         self._arrived = asyncio.Event()
         self._followers: dict[str, Follower] = {}
+        self._trouble: str | None = None  # of the store
         loop = asyncio.get_running_loop()
 
         def changed(token: zenoh.Sample) -> None:
@@ -170,21 +172,26 @@ class Archiver:
             await self._arrived.wait()
 
     async def _cursors(self) -> Mapping[str, Cursor]:
-        pause, trouble = RETRY, None
+        pause = RETRY
         while True:
             try:
                 return await self._stored(self._store.cursors)
-            except StoreDown as error:
-                if str(error) != trouble:
-                    say(f"the store is not ready: {error}")
-                trouble = str(error)
+            except StoreDown:
                 await asyncio.sleep(pause)
                 pause = min(2 * pause, LONGEST_PAUSE)
 
     async def _stored(self, call: Callable[..., T], *arguments: object) -> T:
         """Calls the store in its thread. A call that has begun ends there in any case."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._thread, call, *arguments)
+        loop, trouble = asyncio.get_running_loop(), None
+        try:
+            return await loop.run_in_executor(self._thread, call, *arguments)
+        except StoreDown as error:
+            trouble = str(error)
+            raise
+        finally:
+            if trouble != self._trouble:
+                say(f"the store is not ready: {trouble}" if trouble else "the store is ready")
+            self._trouble = trouble
 
 
 async def archive(gateways: Gateways, place: str, every: float | None, rate: int) -> None:

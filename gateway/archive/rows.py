@@ -53,7 +53,7 @@ class Row(NamedTuple):
 
 
 def row_of(key: str, known: Known) -> Row:
-    """Returns the row of a checked document. (Texts have no NUL: no database takes it.)"""
+    """Returns the row of a checked document."""
     value, text = known["value"], known.get("text")
     elements: tuple[float, ...] | None = None
     if isinstance(value, list):
@@ -68,12 +68,17 @@ def row_of(key: str, known: Known) -> Row:
         (datetime.fromisoformat(known["time"]) - _EPOCH) // _MICROSECOND,
         key,
         None if value is None else float(value),
-        None if text is None else text.replace("\0", "\ufffd"),
+        _clean(text),
         elements,
-        None if known["quality"] == "good" else known["reason"],
-        known.get("origin"),
-        known.get("limited"),
+        None if known["quality"] == "good" else _clean(known["reason"]),
+        _clean(known.get("origin")),
+        _clean(known.get("limited")),
     )
+
+
+def _clean(text: str | None) -> str | None:
+    """No database takes a NUL."""
+    return None if text is None else text.replace("\0", "\ufffd")
 
 
 def _is_large(value: object) -> bool:

@@ -17,6 +17,7 @@ from gateway.bridges.program import Gateways
 from gateway.bridges.program import run as run_program
 from gateway.cli.terminal import ROUTER, AsJson, ZenohFile, out, printable
 from gateway.contract.line_faults import span
+from gateway.errors import GatewayError
 
 cli = typer.Typer(help="The histories of many gateways in one store.", no_args_is_help=True)
 
@@ -58,6 +59,8 @@ def status(store: Place, as_json: AsJson = False) -> None:
         cursors = sorted(opened.cursors().values(), key=lambda cursor: cursor.gateway)
     finally:
         opened.close()
+    if not cursors:
+        raise GatewayError(f"{store}: nothing is archived here")
     now = time.time()
     if as_json:
         for cursor in cursors:
