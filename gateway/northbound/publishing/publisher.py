@@ -44,6 +44,42 @@ _Data = bytes | Sample | bool | dict[str, Sample] | Callable[[], bytes]
 _Entry = tuple[zenoh.Timestamp | None, str, _Data]
 
 
+class _Sender:
+    """Sends one entry at a time. Belongs to the publishing thread."""
+
+    def __init__(self) -> None:
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._blocks = Counter[str]()  # sent since the start, by key
+
+    def send(
+        self,
+        session: zenoh.Session,
+        stamp: zenoh.Timestamp | None,
+        key: str,
+        data: Sample | bool | dict[str, Sample] | Callable[[], bytes],
+    ) -> bool:
+        """Returns True if it was a put."""
+        if isinstance(data, Sample):
+            encoding.put(session, key, data, stamp)
+        elif isinstance(data, dict):
+            self._blocks[key] += 1
+            place = payload.place(str(session.zid()), self._blocks[key])
+            encoding.put_json(session, key, payload.block(data.values()), stamp, place)
+        elif isinstance(data, bool):
+            self._set_token(session, key, declared=data)
+            return False
+        else:
+            encoding.put_json(session, key, data(), stamp, urgent=True)
+        return True
+
+    def _set_token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:
+        if not declared:
+            if token := self._tokens.pop(key, None):
+                token.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        elif key not in self._tokens:
+            self._tokens[key] = session.liveliness().declare_token(key)
+
+
 class Publisher:
     """The queue (event loop) and the thread that empties it."""
 
@@ -56,12 +92,10 @@ class Publisher:
         self._losses = losses
         self._online: dict[str, bool] = {}  # by device
         self._session: zenoh.Session | None = None
-        self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._waiting: dict[Hashable, _Entry] = {}
         self._urgent: dict[Hashable, _Entry] = {}
         self._batch: list[_Entry] = []  # the next one at the end
         self._waiting_events = 0
-        self._blocks = Counter[str]()  # sent since the start, by key
         self._closing = False
         self._handover = Handover(lambda: len(self._waiting) + len(self._batch))
         self._thread: threading.Thread | None = None
@@ -213,6 +247,7 @@ class Publisher:
 
     def _send_all(self, session: zenoh.Session) -> None:
         handover, losses, monotonic = self._handover, self._losses, time.monotonic
+        sender = _Sender()
         while self._next_batch():
             batch, before = self._batch, monotonic()
             while batch:
@@ -222,7 +257,7 @@ class Publisher:
                         encoding.put_json(session, key, data, stamp)
                         handover.puts += 1
                     else:
-                        self._send(session, stamp, key, data)
+                        handover.puts += sender.send(session, stamp, key, data)
                 except zenoh.ZError as error:
                     if session.is_closed():
                         return
@@ -253,33 +288,6 @@ class Publisher:
                 self._waiting_events = 0
             self._batch += reversed(waiting.values())
             return bool(waiting)
-
-    def _send(
-        self,
-        session: zenoh.Session,
-        stamp: zenoh.Timestamp | None,
-        key: str,
-        data: Sample | bool | dict[str, Sample] | Callable[[], bytes],
-    ) -> None:
-        if isinstance(data, Sample):
-            encoding.put(session, key, data, stamp)
-        elif isinstance(data, dict):
-            self._blocks[key] += 1
-            place = payload.place(str(session.zid()), self._blocks[key])
-            encoding.put_json(session, key, payload.block(data.values()), stamp, place)
-        elif isinstance(data, bool):
-            self._set_token(session, key, declared=data)
-            return
-        else:
-            encoding.put_json(session, key, data(), stamp, urgent=True)
-        self._handover.puts += 1
-
-    def _set_token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:
-        if not declared:
-            if token := self._tokens.pop(key, None):
-                token.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
-        elif key not in self._tokens:
-            self._tokens[key] = session.liveliness().declare_token(key)
 
     def _values_of(self, key: str, data: _Data) -> Sequence[str]:
         """Returns the keys of the values in a put."""
