@@ -54,7 +54,7 @@ TESTS = {
     r"plc-gateway bridge influx|curl -G 'http://127.0.0.1:8086": "tests/bridges/test_influx.py",
     r"plc-gateway bridge opcua ": "tests/bridges/test_opcua.py",
     r"plc-gateway control config.yaml press": "tests/e2e/test_computer_link.py",
-    r"plc-gateway ca (create|issue)": "tests/cli/test_certificates.py",
+    r"(runuser .*)?plc-gateway ca (create|issue)": "tests/cli/test_certificates.py",
     r"plc-gateway ca |.*plc-gateway enrol ": "tests/cli/test_enrolment.py",
     r"plc-gateway trace |plc-gateway replay ": "tests/e2e/test_trace.py",
     r".*pytest tests/cases/test_wire_logs.py": "tests/cases/test_wire_logs.py",
@@ -80,7 +80,7 @@ NOT_RUN = {
     r"systemctl |systemd-sysusers |runuser .* check|kill -HUP \$\(pidof": (
         "it changes the services of the machine; tests/test_packaging.py reads the units"
     ),
-    r"(ln|cp|install) .*(/opt|/etc|history\.db)|rm -f history\.db": "it changes the machine",
+    r"(ln|cp|install) .*(/opt|/etc|/var|history\.db)|rm -f history\.db": "it changes the machine",
     r"cat /etc/": "the file is that of a person",
     r"(sha256sum|gh|tar|cd) ": "it needs a published release; tests/test_release.py makes one",
     r"python3 -m venv /opt": "it changes the machine; .ci/smoke does the same elsewhere",
