@@ -125,6 +125,23 @@ class Tab:
                 **button,
             )
 
+    async def touch(self, selector: str, *ways: tuple[float, float]) -> None:
+        """Moves a finger for each way across an element, between shares of its width."""
+        rect = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        left, wide, middle = await self.value(
+            f"(({{x, width, y, height}}) => [x, width, y + height / 2])({rect})"
+        )
+        await self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+        for step in range(6):
+            shares = [begin + (end - begin) * step / 5 for begin, end in ways]
+            points = [
+                {"x": left + wide * share, "y": middle, "id": number}
+                for number, share in enumerate(shares)
+            ]
+            kind = "touchMove" if step else "touchStart"
+            await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        await self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     async def screenshot(self, path: Path) -> None:
         answer = await self.call("Page.captureScreenshot", format="png")
         path.write_bytes(base64.b64decode(answer["data"]))

@@ -267,6 +267,30 @@ async def test_a_trend_has_a_cursor_a_zoom_and_bands_of_bad_quality(
             assert await tab.value(text("#pens .value")) == "600"
 
 
+async def test_two_fingers_zoom_a_trend_and_one_moves_it(tab: Tab, tmp_path: Path) -> None:
+    now = time.time_ns()
+    plant = PlainPlant(PlainDevice(SPEED.device, (SPEED,)))
+    with history(tmp_path / "history.db") as historian:
+        historian.record([good(SPEED, one, now - (600 - one) * SECOND) for one in range(600)])
+        async with serving(history=historian, plant=plant) as client:
+            await tab.look(390, 844)
+            await opened(tab, client, f"trend?tags={SPEED.key}&span=600")
+            await tab.until("!!document.querySelector('#chart .u-over')")
+            ends = "(location.hash.match(/from=([\\d.]+)&to=([\\d.]+)/) ?? []).slice(1).map(Number)"
+            await tab.touch("#chart .u-over", (0.4, 0.2), (0.6, 0.8))
+            await tab.until(f"{ends}.length === 2")
+            [from_, to] = await tab.value(ends)
+            assert 180 < to - from_ < 220  # a third, around the same middle
+            assert now / 1e9 - 420 < from_
+            await tab.touch("#chart .u-over", (0.3, 0.8))
+            await tab.until(f"{ends}[0] < {from_ - 60}")
+            [earlier, until] = await tab.value(ends)
+            assert abs((until - earlier) - (to - from_)) < 1
+            assert 80 < from_ - earlier < 120  # half of the width
+            await tab.touch("#chart .u-over", (0.1, 0.45), (0.9, 0.55))
+            await tab.until("/span=\\d+$/.test(location.hash)")  # it reaches now again
+
+
 async def test_fifty_thousand_tags_scroll_in_a_few_rows(tab: Tab) -> None:
     devices = [
         PlainDevice(f"d{number}", tuple(tag(f"d{number}", f"t{one}") for one in range(500)))

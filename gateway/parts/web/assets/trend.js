@@ -15,6 +15,7 @@ const AXES = 2; // units with an axis of their own
 let keys = [];
 let spanOf = 3600; // s, up to now
 let fixed = null; // [from, to] in s, of a zoom
+let touched = null; // the same, while fingers move it
 let chart = null;
 let drawn = null; // what is drawn: { step, series }
 let loading = 0; // its number
@@ -22,7 +23,7 @@ let due = 0;
 let askedAt = 0;
 
 const seconds = () => (now() || Date.now()) / 1000;
-const range = () => fixed ?? [seconds() - spanOf, seconds()];
+const range = () => touched ?? fixed ?? [seconds() - spanOf, seconds()];
 
 let library = null;
 
@@ -47,6 +48,8 @@ export function showTrend() {
 
 export function leaveTrend() {
   loading += 1;
+  fingers.clear();
+  touched = null;
   chart?.destroy();
   chart = null;
   drawn = null;
@@ -67,8 +70,14 @@ function zoom([from, to]) {
 function move(by, factor = 1) {
   const [from, to] = range();
   const [middle, half] = [(from + to) / 2 + by * (to - from), ((to - from) * factor) / 2];
-  if (middle + half >= seconds() && by >= 0) return choose({ span: Math.round(2 * half), from: "", to: "" });
-  zoom([middle - half, middle + half]);
+  if (by < 0) zoom([middle - half, middle + half]);
+  else settle([middle - half, middle + half]);
+}
+
+// A range that reaches now goes on with it.
+function settle([from, to]) {
+  if (to < seconds()) zoom([from, to]);
+  else choose({ span: Math.max(2, Math.round(to - from)), from: "", to: "" });
 }
 
 byId("spans").append(...SPANS.map((value) =>
@@ -80,6 +89,48 @@ byId("chart").addEventListener("keydown", (event) => {
   if (!how) return;
   event.preventDefault();
   move(...how);
+});
+
+// -- touch: one finger moves the curve, two zoom it --
+
+const LONGEST = 3.2e8; // s: ten years
+const fingers = new Map(); // by number: [x at the beginning, x now], in px
+let held = null; // the range at the beginning
+
+function grip() {
+  held = touched ?? range();
+  for (const finger of fingers.values()) finger[0] = finger[1];
+}
+
+// The times that were under the fingers stay under them.
+function pull() {
+  const { left, width } = chart.over.getBoundingClientRect();
+  const time = (x) => held[0] + ((x - left) / width) * (held[1] - held[0]);
+  const [[was, is], [was2, is2] = []] = [...fingers.values()];
+  const scale = was2 === undefined ? (held[1] - held[0]) / width : (time(was2) - time(was)) / (is2 - is);
+  if (!(scale > 2 / width && scale < LONGEST / width)) return;
+  const from = time(was) - (is - left) * scale;
+  touched = [from, from + width * scale];
+  chart.setScale("x", { min: touched[0], max: touched[1] });
+}
+
+byId("chart").addEventListener("pointerdown", (event) => {
+  if (event.pointerType !== "touch" || !chart || fingers.size === 2) return;
+  fingers.set(event.pointerId, [event.clientX, event.clientX]);
+  grip();
+});
+byId("chart").addEventListener("pointermove", (event) => {
+  const finger = fingers.get(event.pointerId);
+  if (!finger || !chart) return;
+  finger[1] = event.clientX;
+  pull();
+});
+for (const kind of ["pointerup", "pointercancel"]) byId("chart").addEventListener(kind, (event) => {
+  if (!fingers.delete(event.pointerId)) return;
+  if (fingers.size) return grip();
+  const ends = touched;
+  touched = null;
+  if (ends) settle(ends);
 });
 
 // -- the chosen tags --
