@@ -50,6 +50,7 @@ class Rings:
     """Telephones that the modem dials between two calls, because of an alarm."""
 
     def __init__(self) -> None:
+        self.calls: DialSchedule | None = None  # while the modem is there
         self._waiting = deque[tuple[str, asyncio.Future[None]]]()
 
     def __bool__(self) -> bool:
@@ -78,6 +79,7 @@ class Rings:
 
     def lose(self, why: str) -> None:
         """Ends all of them: the modem is lost."""
+        self.calls = None
         while self._waiting:
             _, ended = self._waiting.popleft()
             if not ended.done():

@@ -65,7 +65,6 @@ class Line:
         duty = duty or SendPermit()
         self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
-        self.calls: DialSchedule | None = None  # while a modem is there
         self.rings = Rings()
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
@@ -81,6 +80,11 @@ class Line:
     @property
     def name(self) -> str:
         return self.engine.name
+
+    @property
+    def calls(self) -> DialSchedule | None:
+        """None: no modem is there."""
+        return self.rings.calls
 
     @property
     def dialling(self) -> float:
@@ -261,8 +265,8 @@ class Line:
             self.tried.set()
             rules = rules_of(self._open_port)
             if rules is not None and isinstance(port, CallPort):
-                self.calls = DialSchedule(self.engine, rules)
-                await serve_calls(self, port, self.calls)
+                calls = self.rings.calls = DialSchedule(self.engine, rules)
+                await serve_calls(self, port, calls)
             await self.serve(channel)
         except LineDown as error:
             known = str(error) == self.engine.record.trouble
@@ -297,7 +301,7 @@ class Line:
 
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
-        self._transaction = self.calls = None
+        self._transaction = None
         self.rings.lose(f"line {self.name}: its modem was lost")
         self.engine.reach_by_modem(False)
         self._alarm.cancel()  # its timer would keep an ended line alive
