@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.port_rules import check_connection, check_tls, direction
+from gateway.config.port_rules import check_connection, check_heartbeat, check_tls, direction
 from gateway.config.settings.model import LineSection
 from gateway.config.settings.modem_settings import ModemSection
 from gateway.engine.device.device_settings import DeviceSettings
@@ -42,6 +42,7 @@ def check_line(
         _check_listening(line, devices, path, mistakes)
     check_connection(line, devices, path, mistakes)
     check_tls(line, devices, path, mistakes)
+    check_heartbeat(line, devices, path, mistakes)
     for device in devices:
         driver, place = device.driver, (*path, "devices", device.name)
         if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):

@@ -8,6 +8,7 @@ from gateway.config.messages import Mistakes, Path
 from gateway.config.settings.model import ConnectionSection, LineSection
 from gateway.config.settings.zenoh_records import tls_files
 from gateway.engine.device.device_settings import DeviceSettings
+from gateway.protocols.swapped import KnownReplies
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.transport.port import (
     DeviceServer,
@@ -88,6 +89,22 @@ def check_device_servers(lines: Mapping[str, PortAddress], mistakes: Mistakes) -
                 mistakes.add(place, text)
                 break
         others[name] = mine
+
+
+def check_heartbeat(
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """What a device server sends by itself is dropped: no reply may begin with it."""
+    own = line.device_server
+    for name in ("registration", "heartbeat") if own is not None else ():
+        word: bytes = getattr(own, name) or b""
+        for device in devices if word else ():
+            driver = device.driver
+            starts = driver.reply_starts if isinstance(driver, KnownReplies) else ()
+            if any(one.startswith(word) or word.startswith(one) for one in starts):
+                text = f"replies of {device.name} begin with it, and it is dropped from what "
+                text += "arrives: set another one in the device server, such as the text ping"
+                mistakes.add((*path, "device_server", name), text)
 
 
 def check_tls(

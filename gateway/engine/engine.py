@@ -82,7 +82,8 @@ class Engine:
         self._next_job = NextJob(in_flight, proofs, *results, effects, gap)
         shared = (self.record, self.schedule, in_flight, staleness, health, effects)
         self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
-        self._charged: Device | None = None  # its use of the wire grows: by due polls, and probes
+        # Its use of the wire grows: by due polls, and probes; that of the line by requests.
+        self._charged: Device | LineRecord | None = None
         self._replies = 0  # of all stations, until the port was opened
 
     # The cycle of the line
@@ -118,7 +119,8 @@ class Engine:
         elif isinstance(job, Reopen):
             return job
         else:
-            self._charged = job.device if isinstance(job, Probe) else None
+            others = job.device if isinstance(job, Probe) else None
+            self._charged = others if isinstance(job, Probe | Answer | Identify) else self.record
             if (shapes := job.device.shapes) is not None:
                 if isinstance(job, Probe):
                     shapes.probed(job.outstanding, job.token, job.device.probe_spans, now)
@@ -164,8 +166,9 @@ class Engine:
         if in_flight.continuation is None:
             in_flight.job = None
             in_flight.failed.clear()
-            if self._charged is not None and len(self.devices) > 1:
-                self._charged.used(now, in_flight.begun)
+            charged = self._charged
+            if charged is not None and (charged is self.record or len(self.devices) > 1):
+                charged.used(now, in_flight.begun)
         effects, self._effects.collected = self._effects.collected, []
         if not good or len(effects) != 1 or self.deadline <= now:
             self._set_deadline()  # a good end alone makes it no earlier
@@ -328,14 +331,14 @@ class Engine:
         """Notes that a device server may have kept requests of an earlier process."""
         self._next_job.inherit()
 
-    def opened(self, now: float) -> list[Effect]:
-        """Starts all devices again, because the port was opened."""
+    def opened(self, now: float, note: str = "") -> list[Effect]:
+        """Starts all devices again, because the port was opened. `note`: what is wrong with it."""
         self.is_open = True
         self._replies = self._count_replies()
         self.record.open(now)
         self._in_flight.clear()
         for device in self.devices:
-            device.restart()
+            device.restart(note=note)
         self.schedule.opened(now)
         self.rules.opened(now)
         self._set_deadline()

@@ -32,6 +32,7 @@ from gateway.line.wire_log import WireLog
 from gateway.protocols.driver import Span
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.transport import Port, Receiver
+from gateway.transport.port import Noted
 
 log = structlog.get_logger("gateway.line")
 
@@ -261,7 +262,7 @@ class Line:
             port = await self._open_port(self)
             channel = self.begin(port)
             log.info("line open", line=name)
-            self.deliver(self.engine.opened(_now()))
+            self.deliver(self.engine.opened(_now(), port.note if isinstance(port, Noted) else ""))
             self.tried.set()
             rules = rules_of(self._open_port)
             if rules is not None and isinstance(port, CallPort):

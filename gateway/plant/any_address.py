@@ -52,11 +52,9 @@ class AnyAddress:
             units += map(int, (await line.peek(receiver, part, within)).split())
         return units
 
-    def seconds(self, device: str, span: Span) -> float:
-        """Returns the wire time of `read`."""
-        _, receiver = self.place(device)
-        costs = map(receiver.driver.cost, _parts(receiver, span))
-        return sum(receiver.seconds(cost) for cost in costs if cost is not None)
+    def requested(self, device: str) -> float:
+        """Returns the seconds that the line of the device has spent on requests so far."""
+        return self._places[device][0].engine.record.requested if device in self._places else 0.0
 
     def known(self, device: str, span: Span, max_age: float) -> list[int] | None:
         """Returns the units if a poll has read all of them together in the last `max_age` seconds,

@@ -8,6 +8,7 @@ they are no bytes of the line.
 import asyncio
 import socket
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
@@ -32,6 +33,7 @@ log = structlog.get_logger("gateway.line")
 REGISTERS_WITHIN = 10.0  # seconds
 MOST_UNREGISTERED = 64  # connections; for one more the oldest of the busiest address is closed
 SILENT = 5.0  # seconds after which a second connection of a registration replaces the first
+ONE_REPLY = 2.0  # seconds between two packets of one reply, at most
 UNUSED = 30.0  # seconds without a line until a door closes: a line that reopens needs it again
 _LOG_EVERY = 10.0  # seconds
 _WAITING = 100  # connections that the system accepts before this process does
@@ -61,6 +63,7 @@ class _Connection(StreamPort):
         self.handshake: asyncio.Task[None] | None = None
         self.ended = False
         self.heard_at = asyncio.get_running_loop().time()
+        self._answering = False  # bytes arrived since the last request, but heartbeats
         self.ready()
 
     @property
@@ -102,15 +105,23 @@ class _Connection(StreamPort):
             self._door.refuse(self, "its certificate has another name")
 
     def data_received(self, data: bytes) -> None:
-        self.heard_at = asyncio.get_running_loop().time()
+        before, self.heard_at = self.heard_at, asyncio.get_running_loop().time()
+        if self.heard_at - before > ONE_REPLY:
+            self._answering = False
         if self.server is None:
             self.greeting = (self.greeting + data)[:LONGEST_REGISTRATION]
             self._door.greeted(self)
             return
-        while word := next((one for one in self.server.words if data.startswith(one)), b""):
-            data = data[len(word) :]
-        if data:
-            super().data_received(data)
+        rest = _without(self.server.words, data)
+        if rest and self._answering:  # the rest of a reply: a heartbeat is not its beginning
+            rest = _without((self.server.registration,), data)
+        if rest:
+            self._answering = True
+            super().data_received(rest)
+
+    def write(self, data: bytes) -> None:
+        self._answering = False
+        super().write(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._door.lost(self)
@@ -315,6 +326,13 @@ def close_doors() -> None:
     """Closes every port that device servers connect to, in this event loop."""
     for door in _doors.pop(asyncio.get_running_loop(), {}).values():
         door.close()
+
+
+def _without(words: Sequence[bytes], data: bytes) -> bytes:
+    """Returns the data without the words that begin it."""
+    while word := next((one for one in words if one and data.startswith(one)), b""):
+        data = data[len(word) :]
+    return data
 
 
 def _shown(data: bytes) -> str:

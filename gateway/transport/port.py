@@ -34,6 +34,15 @@ class Port(Protocol):
 
 
 @runtime_checkable
+class Noted(Protocol):
+    """A port that was opened, but not as the file says."""
+
+    @property
+    def note(self) -> str:
+        """Why its devices may not answer, one sentence; empty: nothing is known."""
+
+
+@runtime_checkable
 class Adjustable(Protocol):
     """A port whose speed, format and modem lines can be changed while it is open."""
 

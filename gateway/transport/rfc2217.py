@@ -1,7 +1,7 @@
 """Opens serial ports behind device servers and sets their baud rate and format (RFC 2217)."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 
 import structlog
@@ -28,6 +28,7 @@ from gateway.transport.telnet import (
 # Many servers acknowledge only some settings, or none.
 LONGEST_WAIT = 1.0  # seconds for each setting
 _LONGEST_TEXT = 80
+_RATE_NEAR = 0.03  # share by which two baud rates may differ
 
 _log = structlog.get_logger(__name__)
 
@@ -67,6 +68,7 @@ class Rfc2217Port:
         self._loss: Exception | None = None
         self._acknowledged: dict[Setting, int] = {}  # with the value that the server reports
         self._changed = asyncio.Event()
+        self.note = ""  # what the server did not take
 
     async def set_up(self, tcp: StreamPort, settings: SerialSettings, timeout: float) -> None:
         """Agrees on the options and sets baud rate and format. Raises `LineDown`."""
@@ -86,6 +88,7 @@ class Rfc2217Port:
         }
         for setting, value in requested.items():
             await self._ask(tcp, setting, value)
+        self.note = "; ".join(_refused(requested, self._acknowledged))
         if self._telnet.consent(BINARY, ours=True) is not Consent.YES:
             _log.warning(
                 "binary mode not agreed",
@@ -192,3 +195,15 @@ class Rfc2217Port:
         if self.is_open:
             self.is_open = False
             self._receiver.lost(error)
+
+
+def _refused(requested: Mapping[Setting, int], taken: Mapping[Setting, int]) -> Iterator[str]:
+    """Yields a sentence for each setting of which the server says that it has another value."""
+    spelt = {Setting.PARITY: {number: letter for letter, number in PARITIES.items()}}
+    for setting, value in requested.items():
+        found = taken.get(setting, value)
+        near = setting is Setting.BAUDRATE and abs(found - value) <= _RATE_NEAR * value
+        if found and found != value and not near and setting is not Setting.PURGE:
+            has, wanted = (spelt.get(setting, {}).get(one, one) for one in (found, value))
+            what = setting.name.lower().replace("_", " ")
+            yield f"The device server has {what} {has}, not {wanted}: it refused it"

@@ -373,6 +373,14 @@ LINES = [
         "5: lines.hall.connect_delay: a delay is at most 10s: requests wait for it",
     ),
     bad(
+        "a heartbeat that begins every reply",
+        on_line("port: listen://0.0.0.0:5020\n"
+                "device_server: {registration: DTU-1, heartbeat: <01>}\n"
+                "devices: {pump: {protocol: modbus-rtu, station: 1}}"),
+        "4: lines.hall.device_server.heartbeat: replies of pump begin with it, and it is dropped "
+        "from what arrives: set another one in the device server, such as the text ping",
+    ),
+    bad(
         "rounds that another master decides, and whose delay is longer than a round",
         on_line("port: tcp://10.0.0.7:4001\nlisten_only: true\nclose_after: round\n"
                 "connect_delay: 2s\n"

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from struct import pack
 from typing import Any, NoReturn
@@ -14,12 +14,12 @@ import pytest
 from gateway.config import built
 from gateway.config.messages import ConfigErrors
 from gateway.contract.keys import Keys
-from gateway.errors import Refused
+from gateway.errors import NoReply, Refused
 from gateway.line.send_permit import SendPermit
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import OwnWrites
 from gateway.parts.doors.guest import MOST_WAITING, Guest
-from gateway.parts.doors.guest_requests import NO_REPLY, GuestRequests
+from gateway.parts.doors.guest_requests import NO_REPLY, NOT_NOW, GuestRequests
 from gateway.parts.doors.open_door import HELD, OpenDoor
 from gateway.parts.doors.plan import door_plans, door_warnings
 from gateway.parts.doors.repeated_reads import MOST_KEPT, RepeatedReads
@@ -349,6 +349,36 @@ async def test_a_read_that_needs_several_requests_costs_them_all() -> None:
         assert len(await program.ask(tcp("03 0064 007d"))) == 7 + 2 + 250
         assert 0.003 < hall.door.document(now())["share"] < 0.02  # 13 requests in a minute
         assert await program.ask(tcp("03 0064 007d")) == b""  # its time is used up for a while
+
+
+class Slow:
+    """Addresses that take 3 s of the line to read, and time out. In place of `AnyAddress`."""
+
+    spent = 0.0
+
+    def requested(self, _device: str) -> float:
+        return self.spent
+
+    async def read(self, *_: object) -> list[int]:
+        await asyncio.sleep(3)
+        self.spent += 3
+        raise NoReply("no reply")
+
+
+@on_virtual_time
+async def test_the_time_of_a_share_is_measured_and_each_door_has_its_own() -> None:
+    """It was that of the plan: a silent address cost 30 ms of the share, and 1 s of the wire."""
+    async with opened(door("hall", "modbus-tcp", most="90%")) as hall:
+        small, large = (replace(hall.door.settings, name=f"{n}", most=n / 100) for n in (10, 90))
+        slow: Any = Slow()
+        north: Any = None
+        turns, step = GuestRequests(slow, north), Step("press", writes=False)
+        step.cells["holding", 10] = 0
+        assert await turns.carry_out(step, small, "a test", 10.0) is NO_REPLY
+        assert 60 * turns.share(now()) == pytest.approx(3.0)
+        assert await turns.carry_out(step, small, "a test", 20.0) is NOT_NOW  # 3 s / 10 % is 30 s
+        assert await turns.carry_out(step, large, "a test", 1.0) is NO_REPLY
+        assert await turns.carry_out(step, small, "a test", 30.0) is NO_REPLY
 
 
 @on_virtual_time

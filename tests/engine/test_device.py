@@ -107,6 +107,20 @@ def test_silence_has_its_diagnosis(dev: Device) -> None:
     assert dev.record.failures["other"] == 1
 
 
+def test_a_port_that_refused_a_setting_is_the_diagnosis_of_silence(dev: Device) -> None:
+    note = "The device server has baudrate 9600, not 19200: it refused it"
+    dev.restart(note=note)
+    assert dev.diagnosis() == ""
+    dev.health.unclear(NoReply("no reply"), None, 0.0)
+    assert dev.diagnosis() == note
+    dev.health.answered()
+    dev.health.unclear(NoReply("no reply"), None, 0.0)
+    assert dev.diagnosis() != note
+    dev.restart()
+    dev.health.unclear(NoReply("no reply"), None, 0.0)
+    assert dev.diagnosis() != note
+
+
 def test_the_turnaround_is_smoothed_over_about_ten_exchanges(dev: Device) -> None:
     dev.record.count_exchanges(1, 0.0, 0.010)
     assert dev.record.replies.turnaround == 0.010

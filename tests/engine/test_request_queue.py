@@ -1,8 +1,13 @@
 """The waiting requests of a line: peeks wait behind all others, and take none of their places."""
 
+import pytest
+
+from gateway.engine.device.health import State
+from gateway.engine.jobs.jobs import Sent
 from gateway.engine.jobs.request_queue import MOST_PEEKS, MOST_WAITING, RequestQueue
 from gateway.engine.jobs.requests import Command
 from gateway.protocols.driver import Span
+from tests.engine.rig import Rig
 from tests.sim.plant import device
 
 
@@ -31,3 +36,18 @@ def test_each_kind_has_its_own_places() -> None:
     commands = [queue.submit(command("run")) for _ in range(MOST_WAITING + 1)]
     assert commands == [True] * MOST_WAITING + [False]
     assert not queue.has_room(1)
+
+
+def test_the_time_of_requests_is_counted_with_their_time_outs_and_that_of_polls_is_not() -> None:
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    record = rig.engine.record
+    rig.conclude(rig.transacted(), [0] * 6, took=0.3)
+    assert record.requested == 0.0
+    rig.write("D0")
+    rig.conclude(rig.transacted(), Sent(), took=0.25)
+    assert record.requested == pytest.approx(0.25)
+    rig.conclude(rig.transacted(), [0] * 6)  # the poll that shows the written value
+    rig.command()
+    rig.fail(rig.transacted())
+    assert record.requested == pytest.approx(0.25 + 0.6)

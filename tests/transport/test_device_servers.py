@@ -216,3 +216,60 @@ def test_a_port_to_listen_at_is_written_as_an_address() -> None:
     assert parse_port("listen://[::]:5020") == ListenAddress("::", 5020)
     assert DeviceServer(networks=(ip_network("10.1.0.0/16"),)).allows("::ffff:10.1.2.3")
     assert not DeviceServer(networks=(ip_network("10.1.0.0/16"),)).allows("10.2.0.1")
+
+
+# What device servers of three makers send by themselves, as their manuals print it: when they have
+# connected, now and then, and the settings of the line for it.
+MAKERS = {
+    # USR-GPRS232-701 V1.3, 6.2: AT+CIPPACK=1,"4C4F47494E3A31303031", AT+CIPPACK=0,"4C4F47".
+    "USR-GPRS232": (b"LOGIN:1001", b"LOG", DeviceServer(b"LOGIN:1001", b"LOG")),
+    # USR-DR404, 3.8: AT+HEARTDT=7777772E7573722E636E; USR-N580, 5.6: the MAC address, as bytes.
+    "USR-DR404": (
+        bytes.fromhex("d8b04c4635ca"),
+        bytes.fromhex("7777772e7573722e636e"),
+        DeviceServer(bytes.fromhex("d8b04c4635ca"), b"www.usr.cn"),
+    ),
+    # Four-Faith, data in PROT mode: ID, telephone number, 0, address, 0; the address may change.
+    "Four-Faith": (
+        bytes.fromhex("78 56 34 12 31 33 30 36 36 36 36 38 38 38 38 00 c0 a8 01 42 00"),
+        b"\xfe",
+        DeviceServer(b"\x78\x56\x34\x1213066668888\0", b"\xfe"),
+    ),
+    # Moxa NPort and NE-4100 as TCP clients (6-13): keep-alives of TCP alone.
+    "Moxa NPort": (b"", b"", DeviceServer()),
+}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+async def test_what_device_servers_of_other_makers_send_is_no_reply(maker: str) -> None:
+    registration, heartbeat, server = MAKERS[maker]
+    where, heard = address(server), RecordingReceiver()
+    opening = asyncio.create_task(opened(where, heard))
+    async with calling(where, registration) as far:
+        port = await opening
+        far[1].write(heartbeat)
+        await exchanged(port, heard, far, b"\x01\x03\x02\x00\x07")
+        far[1].write(heartbeat + heartbeat)
+        await exchanged(port, heard, far, b"\x01\x03\x02\x00\x08")
+        far[1].write(registration[: len(server.registration)])
+        await exchanged(port, heard, far, b"\x01\x03\x02\x00\x09")
+        assert heard.data == b"".join(b"\x01\x03\x02\x00" + bytes((n,)) for n in (7, 8, 9))
+
+
+async def test_the_rest_of_a_reply_keeps_the_byte_of_a_heartbeat() -> None:
+    where, heard = address(DeviceServer(b"DTU-1", b"\xfe")), RecordingReceiver()
+    opening = asyncio.create_task(opened(where, heard))
+    async with calling(where, b"DTU-1") as far:
+        port = await opening
+        port.write(b"request")
+        async with asyncio.timeout(PATIENCE):
+            await far[0].readexactly(7)
+        far[1].write(b"\xfe\x01\x03\x02")  # a heartbeat in one packet with the begin of a reply
+        await heard.until(lambda r: r.data == b"\x01\x03\x02")
+        far[1].write(b"\xfe")  # a heartbeat
+        far[1].write(b"\xfe\x07\xb8\x44")
+        await heard.until(lambda r: len(r.data) >= 6)
+        assert heard.data in (b"\x01\x03\x02\xfe\x07\xb8\x44", b"\x01\x03\x02\xfe\xfe\x07\xb8\x44")
+        port.write(b"request")
+        far[1].write(b"\xfe\x01\x03")
+        await heard.until(lambda r: r.data.endswith(b"\x44\x01\x03"))

@@ -21,7 +21,9 @@ from gateway.transport import (
     open_port,
     rfc2217,
 )
+from gateway.transport.port import Noted
 from gateway.transport.tcp import open_tcp
+from gateway.transport.telnet import Setting
 from tests.conftest import needs
 from tests.transport.ends import PATIENCE, PtyMaster, RecordingReceiver, free_port
 from tests.vectors import vectors
@@ -278,6 +280,23 @@ async def test_a_server_that_sets_something_else_is_logged(
         await port.close()
     row = next(row for row in logs if row["event"] == "setting refused")
     assert (row["setting"], row["requested"], row["actual"]) == ("data_bits", 7, 8)
+    assert isinstance(port, Noted)
+    assert port.note == "The device server has data bits 8, not 7: it refused it"
+
+
+@pytest.mark.parametrize(
+    ("taken", "note"),
+    [
+        ({}, ""),
+        ({Setting.BAUDRATE: 19230, Setting.PARITY: 3, Setting.PURGE: 1}, ""),
+        ({Setting.BAUDRATE: 0}, ""),
+        ({Setting.BAUDRATE: 9600}, "The device server has baudrate 9600, not 19200: it refused it"),
+        ({Setting.PARITY: 1}, "The device server has parity N, not E: it refused it"),
+    ],
+)
+def test_a_setting_that_the_server_refused_is_said(taken: dict[Setting, int], note: str) -> None:
+    requested = {Setting.BAUDRATE: 19200, Setting.PARITY: 3, Setting.PURGE: 3}
+    assert "; ".join(rfc2217._refused(requested, taken)) == note
 
 
 async def test_a_server_lost_with_its_last_acknowledgement_is_line_down() -> None:

@@ -61,6 +61,7 @@ class Device:
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
     use: float = -math.inf
+    _port_note: str = ""  # why it may not answer: the port has other settings than the file
     plan_now: InitVar[bool] = True  # False: the owner calls `plan` before the line runs
 
     def __post_init__(self, plan_now: bool) -> None:
@@ -155,6 +156,8 @@ class Device:
         heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
         if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
             return SWAPPED
+        if self._port_note and not self.health.online:
+            return self._port_note
         return diagnosis(trouble, driver.traits.no_reply_causes)
 
     def takes_one_at_a_time(self, only: bool) -> None:
@@ -177,6 +180,7 @@ class Device:
         self.health, self.record, self.use = old.health, old.record, old.use
         self.health.resyncs_elsewhere()
         self.good_reads.take_over(old.good_reads)
+        self._port_note = old._port_note
         self.one_at_a_time = old.one_at_a_time
         if self.settings.identity == old.settings.identity:
             self.identity = old.identity
@@ -186,8 +190,9 @@ class Device:
             self.shapes.longer.take_over(old.shapes.longer)
             old.shapes.longer, self.shapes = self.shapes.longer, old.shapes
 
-    def restart(self, trouble: LineDown | None = None) -> None:
-        """Starts again after the line was opened or lost."""
+    def restart(self, trouble: LineDown | None = None, note: str = "") -> None:
+        """Starts again after the line was opened or lost. `note`: what is wrong with the port."""
+        self._port_note = note
         self.health.restart(trouble)
         self.monitor.forget()
 

@@ -101,6 +101,7 @@ class LineRecord:
     open_before: float = 0.0  # seconds that it was open before that
     busy: float = 0.0  # characters on the wire, both ways
     turnarounds: float = 0.0  # of stations that replied
+    requested: float = 0.0  # in transactions of writes, commands and peeks
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
     last_trouble: str = ""  # why the port was not open last
@@ -126,6 +127,10 @@ class LineRecord:
         """Counts a transaction: the seconds of its characters, and those of the stations."""
         self.busy += seconds
         self.turnarounds += turnaround
+
+    def used(self, now: float, begun: float) -> None:
+        """Counts the transaction of a request, with its resyncs and time-outs."""
+        self.requested += now - begun
 
     def count_unasked(self, size: int) -> None:
         self.unasked += size

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping
 
 from gateway.contract.interfaces import North
-from gateway.engine.forecast import write_seconds
 from gateway.errors import BadValue, Busy, GatewayError, Offline, Refused
 from gateway.parts.doors.settings import Door
 from gateway.parts.doors.stores import Step
@@ -30,11 +29,14 @@ class GuestRequests:
     silences, its rules about late replies and its resyncs.
     """
 
-    def __init__(self, any_address: AnyAddress, north: North) -> None:
+    def __init__(self, any_address: AnyAddress, north: North, most: float = 1.0) -> None:
+        """`most`: the share of all doors together."""
         self._any = any_address
         self._north = north
         self._turn = asyncio.Lock()
-        self._free_at = 0.0  # by the loop's clock: the share of the doors allows the next request
+        # By the loop's clock: when the share of each door allows its next request; of all: "".
+        self._free_at = dict[str, float]()
+        self._most = most
         self._share, self._shared_at = 0.0, 0.0
 
     async def carry_out(self, step: Step, door: Door, by: str, within: float) -> Outcome:
@@ -49,11 +51,16 @@ class GuestRequests:
         except TimeoutError:
             return NOT_NOW
         try:
-            if self._free_at > ends:
+            free_at = max(self._free_at.get(name, 0.0) for name in (door.name, ""))
+            if free_at > ends:
                 return NOT_NOW
-            await asyncio.sleep(self._free_at - loop.time())
+            await asyncio.sleep(free_at - loop.time())
             left = ends - loop.time()
-            return await (self._write if step.writes else self._read)(step, door, by, left)
+            before = self._any.requested(step.device)
+            try:
+                return await (self._write if step.writes else self._read)(step, door, by, left)
+            finally:
+                self._spend(self._any.requested(step.device) - before, door)
         except Refused as error:
             return Rejected(error.code)
         except BadValue:
@@ -78,10 +85,9 @@ class GuestRequests:
             found |= {(run.area, run.start + ahead): unit for ahead, unit in enumerate(units)}
         return found
 
-    async def _read(self, step: Step, door: Door, _by: str, within: float) -> Outcome:
+    async def _read(self, step: Step, _door: Door, _by: str, within: float) -> Outcome:
         found = dict[Cell, int]()
         for run in step.runs():
-            self._spend(self._any.seconds(step.device, run), door.most)
             units = await self._any.read(step.device, run, within)
             found |= {(run.area, run.start + ahead): unit for ahead, unit in enumerate(units)}
         return found
@@ -96,8 +102,6 @@ class GuestRequests:
             for tag, value in zip(tags, values, strict=True):
                 if value is None or None in values:
                     return Denied(Why.BAD)
-                _, device = self._any.place(step.device)
-                self._spend(write_seconds(device, tag), door.most)
                 took = await self._north.write_own(tag, value, by, within, repeated=False)
                 if took.value != value:  # the device took another one
                     return NO_REPLY if done else Denied(Why.BAD)
@@ -110,12 +114,17 @@ class GuestRequests:
             self._any.refresh(step.device, runs)
         return {}
 
-    def _spend(self, seconds: float, most: float) -> None:
-        """Notes the wire time of a request: the next one waits until the share allows it."""
+    def _spend(self, seconds: float, door: Door) -> None:
+        """Notes the time that the line has spent on a request, with its resyncs and time-outs: the
+        next one waits until the share of its door allows it, and that of all."""
+        if seconds <= 0.0:
+            return
         now = asyncio.get_running_loop().time()
         self._share = self.share(now) + seconds / _MINUTE
         self._shared_at = now
-        self._free_at = max(self._free_at, now) + seconds / most
+        for name, most in ((door.name, door.most), ("", self._most)):
+            begun = max(self._free_at.get(name, 0.0), now - seconds)
+            self._free_at[name] = begun + seconds / most
 
     def share(self, now: float) -> float:
         """Returns the share of the wire time in the last minute."""

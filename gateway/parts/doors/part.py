@@ -31,8 +31,13 @@ class SharingPart:
     async def run(self) -> None:
         plant = self._core.plant
         self._now = asyncio.get_running_loop().time
-        lines = {door.line for door in self._sharing.doors}
-        turns = {line: GuestRequests(plant.any_address, self._core.north) for line in lines}
+        most = dict[str, float]()
+        for door in self._sharing.doors:
+            most[door.line] = max(most.get(door.line, 0.0), door.most)
+        turns = {
+            line: GuestRequests(plant.any_address, self._core.north, share)
+            for line, share in most.items()
+        }
         async with asyncio.TaskGroup() as tasks:
             self._doors = [
                 OpenDoor(door, turns[door.line], plant, tasks, self._core.others.audit)
