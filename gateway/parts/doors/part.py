@@ -32,8 +32,8 @@ class SharingPart:
         plant = self._core.plant
         self._now = asyncio.get_running_loop().time
         most = dict[str, float]()
-        for door in self._sharing.doors:
-            most[door.line] = max(most.get(door.line, 0.0), door.most)
+        for one in self._sharing.doors:
+            most[one.line] = max(most.get(one.line, 0.0), one.most)
         turns = {
             line: GuestRequests(plant.any_address, self._core.north, share)
             for line, share in most.items()
