@@ -202,8 +202,29 @@ class Load:
 # -- one scenario ----------------------------------------------------------------------------------
 
 
+class Gateways(NamedTuple):
+    """The processes of one file: `run --share`."""
+
+    programs: list[Program]
+
+    @property
+    def pids(self) -> list[int]:
+        return [one.process.pid for one in self.programs]
+
+    def used(self) -> float:
+        return sum(one.used() for one in self.programs)
+
+    def stop(self) -> None:
+        for one in self.programs:
+            one.process.terminate()
+        for one in self.programs:
+            one.stop()
+
+
 @contextmanager
-def running(scenario: Scenario, *, changing: bool, slave: Path) -> Iterator[dict[str, Any]]:
+def running(
+    scenario: Scenario, *, changing: bool, slave: Path, shares: int = 1
+) -> Iterator[dict[str, Any]]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         path, record, endpoint = folder / "plant.yaml", folder / "record", free_endpoint()
@@ -215,10 +236,12 @@ def running(scenario: Scenario, *, changing: bool, slave: Path) -> Iterator[dict
         assert slaves.line() == "ready"
         begun = time.monotonic()
         log = stack.enter_context((folder / "log").open("w"))
-        gateway = Program(sys.executable, "-m", "gateway", "run", path, tree=TREE, log=log)
+        command = (sys.executable, "-m", "gateway", "run", path)
+        each = [("--share", f"{n + 1}/{shares}") if shares > 1 else () for n in range(shares)]
+        gateway = Gateways([Program(*command, *one, tree=TREE, log=log) for one in each])
         stack.callback(gateway.stop)
         while not listens(endpoint):
-            if gateway.process.poll() is not None:
+            if gateway.programs[0].process.poll() is not None:
                 raise SystemExit(f"the gateway ended:\n{(folder / 'log').read_text()[-3000:]}")
             time.sleep(0.02)
         consumer = Program(
@@ -255,10 +278,16 @@ class Times(NamedTuple):
 
 
 def measured(
-    scenario: Scenario, *, changing: bool, slave: Path, times: Times, spy: str = ""
+    scenario: Scenario,
+    *,
+    changing: bool,
+    slave: Path,
+    times: Times,
+    spy: str = "",
+    shares: int = 1,
 ) -> dict[str, Any]:
     seconds = times.seconds
-    with running(scenario, changing=changing, slave=slave) as parts:
+    with running(scenario, changing=changing, slave=slave, shares=shares) as parts:
         gateway, consumer, slaves = parts["gateway"], parts["consumer"], parts["slaves"]
         first = consumer.ask(do="wait", within=PATIENCE)["at"]
         if first is None:
@@ -271,23 +300,25 @@ def measured(
         assert writer.line() == "ready"
         time.sleep(times.settle)
         consumer.ask(do="keep")
-        own = [gateway, consumer, slaves, writer]
+        own = [*gateway.programs, consumer, slaves, writer]
         writer.say("")
         begin, load, before = time.monotonic(), Load(), sum(one.used() for one in own)
-        spent, by_thread = gateway.used(), threads(gateway.process.pid)
+        spent, by_thread = gateway.used(), threads(gateway.pids[0])
+        each = [one.used() for one in gateway.programs]
         if spy:
             form = ["-f", "raw"] if spy.endswith(".txt") else []
             spied = ["py-spy", "record", *form, "-g", "-r", "300", "-d", str(int(seconds)), "-p"]
-            subprocess.run([*spied, str(gateway.process.pid), "-o", spy], check=True)
+            subprocess.run([*spied, str(gateway.pids[0]), "-o", spy], check=True)
         time.sleep(max(0.0, begin + seconds - time.monotonic()))
         end = time.monotonic()
         spent = gateway.used() - spent
-        shares = {
+        each = [one.used() - at for one, at in zip(gateway.programs, each, strict=True)]
+        by_name = {
             name: round((one - by_thread.get(name, 0.0)) / (end - begin), 3)
-            for name, one in threads(gateway.process.pid).items()
+            for name, one in threads(gateway.pids[0]).items()
         }
         machine = load.end(sum(one.used() for one in own) - before)
-        size = memory(gateway.process.pid)
+        size = sum(map(memory, gateway.pids))
         writes = json.loads(writer.line())
         writer.close()
         time.sleep(min(DRAIN, times.settle))
@@ -304,7 +335,8 @@ def measured(
         "tags": scenario.all_tags,
         "per_second": scenario.all_tags / scenario.every,
         "cores": round(spent / (end - begin), 3),
-        "threads": {name: share for name, share in shares.items() if share >= 0.01},
+        "cores of each": [round(one / (end - begin), 3) for one in each],
+        "threads": {name: share for name, share in by_name.items() if share >= 0.01},
         "us_per_value": round(spent / max(1, values["arrived"]) * 1e6, 2) if changing else None,
         "MB": round(size),
         "start": {name: round(one, 2) for name, one in start.items()},
@@ -389,6 +421,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="the file for the result")
     parser.add_argument("--table", type=Path, help="print the table of this file")
     parser.add_argument("--docs", action="store_true", help="write the page from the kept result")
+    parser.add_argument("--shares", type=int, default=1, help="processes of one file")
     parser.add_argument("--spy", default="", help="a flame graph of the gateway (py-spy)")
     arguments = parser.parse_args()
     if arguments.table is not None:
@@ -413,7 +446,12 @@ def main() -> None:
         for scenario in chosen:
             for changing in [True] if scenario in CHANGING_ONLY else changes:
                 one = measured(
-                    scenario, changing=changing, slave=slave, times=times, spy=arguments.spy
+                    scenario,
+                    changing=changing,
+                    slave=slave,
+                    times=times,
+                    spy=arguments.spy,
+                    shares=arguments.shares,
                 )
                 print(json.dumps(one), file=sys.stderr, flush=True)
                 results["scenarios"].append(one)

@@ -8,6 +8,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,7 @@ from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, err
 from gateway.config import Config, load
+from gateway.config.share import parse_share
 from gateway.errors import ConfigError, GatewayError
 from gateway.parts.web.settings import WebSection
 from gateway.service import service
@@ -37,16 +39,20 @@ def run(
         LogFormat.TEXT
     ),
     log_level: Annotated[LogLevel, typer.Option(help="debug leaves nothing out")] = LogLevel.INFO,
+    share: Annotated[
+        str, typer.Option(metavar="N/OF", help="only a share of the lines, for example 2/3")
+    ] = "1/1",
 ) -> None:
     """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
+    read = partial(_loaded, share=share)
     if log_format is LogFormat.TEXT:
         with progress(err) as report:
-            loaded = load(config, report)
-        _serve(loaded, config, set_up(log_format, log_level))
+            loaded = read(config, report)
+        _serve(loaded, config, set_up(log_format, log_level), read)
     else:
         set_up(log_format, log_level)  # first: a mistake in the file is a document too
         try:
-            _serve(load(config), config, lambda _text: None)
+            _serve(read(config), config, lambda _text: None, read)
         except GatewayError as error:
             for sentence in str(error).splitlines():
                 log.error("gateway failed", why=sentence)  # noqa: TRY400  (a sentence, no trace)
@@ -54,7 +60,25 @@ def run(
     end_beside_zenoh()
 
 
-def _serve(config: Config, path: Path, say: Callable[[str], None]) -> None:
+def _loaded(
+    path: Path, report: Callable[[str, float], None] | None = None, *, share: str
+) -> Config:
+    """Loads the file, or a share of it, which has a folder of its own."""
+    numbers = parse_share(share)
+    if numbers == (1, 1):
+        return load(path, report)
+    config = load(path, report, share=numbers)
+    if config.folder is not None:
+        try:
+            config.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{config.folder}: {error.strerror}") from None
+    return config
+
+
+def _serve(
+    config: Config, path: Path, say: Callable[[str], None], read: Callable[[Path], Config]
+) -> None:
     tags = sum(len(device.tags) for device in config.devices)
     log.info(
         "gateway starting",
@@ -66,7 +90,7 @@ def _serve(config: Config, path: Path, say: Callable[[str], None]) -> None:
     )
     hint = next_steps(config, path, program())
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(service.run(config, path, lambda: say(hint)))
+        runner.run(service.run(config, path, lambda: say(hint), read))
     log.info("gateway stopped")
 
 

@@ -19,6 +19,7 @@ from gateway.config.build import Builder
 from gateway.config.messages import Mistakes, OptionPlaces
 from gateway.config.settings.records import Config
 from gateway.config.settings.sections import Written, reads, writes
+from gateway.config.share import folder_of, share_of
 from gateway.config.sheets import Grid
 from gateway.config.templates.expand import devices_in, expanded
 from gateway.config.yaml.file import TEXTS, read_yaml
@@ -35,6 +36,7 @@ def load(
     text: str | None = None,
     *,
     elsewhere: bool = False,
+    share: tuple[int, int] | None = None,
 ) -> Config:
     """Reads and checks the file. Paths in it are relative to its folder; those of files that the
     gateway writes are relative to `state_folder()`, if there is one.
@@ -42,14 +44,17 @@ def load(
     `report` receives the name of each step and the share of it that is done. `imports`: a sheet
     with more tags, by device. `text`: what the file is going to have.
     `elsewhere`: it is for another machine; secrets and certificates that it names are there.
-    Raises `ConfigErrors` with every mistake.
+    `share`: returns this share of the file (`config.share`).
+    Raises `ConfigErrors` with every mistake, and `ConfigError` for a file that has no shares.
     """
     read = None if report is None else partial(report, f"reading {Path(path).name}")
     checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
         file, mistakes = read_yaml(Path(path), TEXTS, read, text)
         mistakes.elsewhere = elsewhere
-        builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
+        folder = Path(path).parent
+        kept = state_folder() if share is None else folder_of(share, state_folder() or folder)
+        builder = Builder(mistakes, folder, kept, checked, imports or {})
         data = expanded(file, mistakes, Path(path).parent)
         config = builder.config(data)
         if config is not None:
@@ -58,7 +63,7 @@ def load(
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")
-    return config
+    return config if share is None else share_of(config, share)
 
 
 def digest(data: Mapping[str, Any], config: Config) -> str:

@@ -36,7 +36,6 @@ from gateway.contract.problems import PROBLEMS, Failure, Problem
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.sample import has_json
-from gateway.tags.scan import Samples
 from gateway.tags.tag import READ
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
@@ -123,27 +122,12 @@ def value(sample: Sample) -> bytes:
         return orjson.dumps(sample_fields(sample))
     origin = None if tag.origin is READ else tag.origin.word
     limited = None if tag.shaping.clamp is None else tag.shaping.limited(known)
-    return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time, origin, limited))
-
-
-def scan(samples: Samples) -> list[bytes | Sample]:
-    """The plain good values of a read, as `value`. A sample stays what has more than that."""
-    values, others = samples.plain()
-    text, end = orjson.dumps(values), _end_of_good(samples.time, None, None)
-    joint = b'%b\n{"value":' % end  # JSON has no line end within a value
-    found: list[bytes | Sample] = []
-    found += (b'{"value":%b%b' % (text[1:-1].replace(b",", joint), end)).split(b"\n")
-    if len(found) != len(samples):  # a comma within a value
-        return list(samples)
-    if b"null" in text:
-        others = [place for place, known in enumerate(values) if not has_json(known)]
-    for place in others:
-        found[place] = samples[place]
-    return found
+    return b'{"value":%b%b' % (orjson.dumps(known), end_of_good(sample.time, origin, limited))
 
 
 @lru_cache(maxsize=256)  # the samples of one scan share one time
-def _end_of_good(time: int, origin: str | None, limited: str | None) -> bytes:
+def end_of_good(time: int, origin: str | None = None, limited: str | None = None) -> bytes:
+    """The JSON of a good value after the value itself."""
     named = (("origin", origin), ("limited", limited))
     known = "".join(f',"{name}":"{word}"' for name, word in named if word is not None)
     return f',"quality":"good","time":"{rfc3339(time)}"{known}}}'.encode()

@@ -105,7 +105,7 @@ class Northbound:
         index = TagIndex(self.keys, plant.devices())
         self._admission = Admission(group, self.keys, self._config, index.names, plant.duty)
         losses = SlowPuts(drop_limit(self._config))
-        self._publisher = Publisher(self.keys, losses, index)
+        self._publisher = Publisher(losses, index)
         self._batches = ScanBatches(self._publisher, index)
         self._republisher = Republisher(
             self._batches.publish,

@@ -12,7 +12,7 @@ from typing import Any
 
 import structlog
 
-from gateway.config import Config
+from gateway.config import Config, load
 from gateway.errors import GatewayError
 from gateway.line.arrival import ArrivalClock
 from gateway.line.line import Line
@@ -38,10 +38,15 @@ GC_THRESHOLDS = (5000, 5, 100)
 END_WITHIN = 1.7
 
 
-async def run(config: Config, path: Path, started: Callable[[], None] = lambda: None) -> None:
+async def run(
+    config: Config,
+    path: Path,
+    started: Callable[[], None] = lambda: None,
+    read: Callable[[Path], Config] = load,
+) -> None:
     """Runs the service until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
 
-    SIGHUP reloads the file at `path`, unless the terminal of the process has gone. Calls `started`
+    SIGHUP has the file at `path` read again, unless the terminal has gone. Calls `started`
     when everything is open on Zenoh: once, or each time that this gateway of a standby group
     becomes active.
     """
@@ -56,7 +61,7 @@ async def run(config: Config, path: Path, started: Callable[[], None] = lambda: 
         supervisor.stopping()
         stop.set()
 
-    reloader = Reloader(path, config)
+    reloader = Reloader(path, config, read=read)
     has_terminal = sys.stderr.isatty()
 
     def hang_up() -> None:

@@ -21,13 +21,13 @@ class TagIndex:
     """A dict for concrete keys, and one entry per device for wildcards. Read by many threads."""
 
     def __init__(self, keys: Keys, devices: Iterable[Device]) -> None:
-        self._keys = keys
+        self.keys = keys
         self._entries = [
             _Entry(device, zenoh.KeyExpr(f"{keys.device(device.name)}/**")) for device in devices
         ]
         self.tags: Sequence[Tag] = [tag for entry in self._entries for tag in entry.device.tags]
-        self.keys = {tag: keys.value(tag.key) for tag in self.tags}  # of their values
-        self._by_key = {key: tag for tag, key in self.keys.items()}
+        self.value_keys = {tag: keys.value(tag.key) for tag in self.tags}
+        self._by_key = {key: tag for tag, key in self.value_keys.items()}
         modes = {entry.device.name: entry.device.blocks for entry in self._entries}
         self.names = frozenset(modes)
         self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
@@ -44,15 +44,15 @@ class TagIndex:
 
     def is_device(self, key: str) -> bool:
         """True for the key of one of our devices: no tag, no wildcard."""
-        return self._keys.tag(key) in self.names
+        return self.keys.tag(key) in self.names
 
     def owns(self, key: str) -> bool:
         """True if `key` lies under one of our devices or under our status keys.
 
         Other gateways may share the prefix.
         """
-        device = (self._keys.tag(key) or "").partition("/")[0]
-        return device in self.names or key.startswith(f"{self._keys.own}/")
+        device = (self.keys.tag(key) or "").partition("/")[0]
+        return device in self.names or key.startswith(f"{self.keys.own}/")
 
     def tags_at(self, expression: str) -> list[Tag]:
         """Returns the tags whose value keys intersect `expression`."""
@@ -65,7 +65,7 @@ class TagIndex:
             if selector.includes(entry.area):
                 found.extend(entry.device.tags)
             elif selector.intersects(entry.area):
-                keys = ((tag, self.keys[tag]) for tag in entry.device.tags)
+                keys = ((tag, self.value_keys[tag]) for tag in entry.device.tags)
                 found.extend(tag for tag, key in keys if selector.intersects(key))
         return found
 
@@ -75,5 +75,5 @@ class TagIndex:
         return [
             entry.device
             for entry in self._entries
-            if selector.intersects(self._keys.device(entry.device.name))
+            if selector.intersects(self.keys.device(entry.device.name))
         ]

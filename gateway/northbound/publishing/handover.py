@@ -25,6 +25,7 @@ class Handover:
     def __init__(self, waiting: Callable[[], int]) -> None:
         """`waiting`: returns the number of waiting puts."""
         self.lock = threading.Condition()
+        self.closing = False  # the thread ends when nothing waits
         self.puts = 0  # since the start
         self.until = inf  # the slice ends with so many puts
         self._waiting = waiting

@@ -25,7 +25,6 @@ import zenoh
 
 from gateway.contract import payload
 from gateway.contract.blocks import parts_of
-from gateway.contract.keys import Keys
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.publishing import encoding
 from gateway.northbound.publishing.handover import Handover
@@ -83,11 +82,10 @@ class _Sender:
 class Publisher:
     """The queue (event loop) and the thread that empties it."""
 
-    def __init__(self, keys: Keys, losses: SlowPuts, index: TagIndex) -> None:
+    def __init__(self, losses: SlowPuts, index: TagIndex) -> None:
         self.ended = asyncio.Event()  # the thread has ended, expected or not
         self.superseded = Counter[str]()  # values that a newer one replaced here, by key
         self._dropped = 0  # events and documents: the queue was full, or no session was open yet
-        self._keys = keys
         self._index = index
         self._losses = losses
         self._online: dict[str, bool] = {}  # by device
@@ -96,7 +94,6 @@ class Publisher:
         self._urgent: dict[Hashable, _Entry] = {}
         self._batch: list[_Entry] = []  # the next one at the end
         self._waiting_events = 0
-        self._closing = False
         self._handover = Handover(lambda: len(self._waiting) + len(self._batch))
         self._thread: threading.Thread | None = None
 
@@ -114,7 +111,7 @@ class Publisher:
     @property
     def session(self) -> zenoh.Session | None:
         """The open session; None before and after."""
-        return None if self._closing else self._session
+        return None if self._handover.closing else self._session
 
     def start(self, session: zenoh.Session) -> None:
         self._session = session
@@ -133,11 +130,11 @@ class Publisher:
 
         Before the session is open samples are dropped: opening publishes all current values.
         """
-        if self._session is None or self._closing:
+        if self._session is None or self._handover.closing:
             return
         data: Sequence[_Data]
         if isinstance(samples, Samples):
-            keys, data = self._keys_of(samples.tags), payload.scan(samples)
+            keys, data = self._keys_of(samples.tags), encoding.scan(samples)
         else:
             last = {sample.tag: sample for sample in samples}
             keys, data = self._keys_of([*last]), [*last.values()]
@@ -154,17 +151,17 @@ class Publisher:
         self._handover.soon()
 
     def _keys_of(self, tags: Sequence[Tag]) -> list[str]:
-        known = self._index.keys  # a disabled tag may have gone already
-        return [known.get(tag) or self._keys.value(tag.key) for tag in tags]
+        known = self._index.value_keys  # a disabled tag may have gone already
+        return [known.get(tag) or self._index.keys.value(tag.key) for tag in tags]
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:
         """Queues the changed samples of one scan of a device, merged with a waiting block.
 
         A long block goes out in parts: many clients drop long messages.
         """
-        if self._session is None or self._closing:
+        if self._session is None or self._handover.closing:
             return
-        key = self._keys.block(device)
+        key = self._index.keys.block(device)
         merged: dict[str, Sample] = {}
         with self._handover.lock:
             for part in range(len(self._waiting)):
@@ -180,11 +177,11 @@ class Publisher:
     def events(self, samples: Iterable[Sample]) -> None:
         """Queues samples that all go out, in order (bar codes). Drops those beyond the limit."""
         for sample in samples:
-            self._queue_event(self._keys.value(sample.tag.key), sample)
+            self._queue_event(self._index.keys.value(sample.tag.key), sample)
 
     def document(self, key: str, document: bytes) -> None:
         """Queues a status document, or the outcome of a write, which is urgent."""
-        self._queue_event(key, (lambda: document) if key == self._keys.writes else document)
+        self._queue_event(key, (lambda: document) if key == self._index.keys.writes else document)
 
     def latest(self, key: str, make: Callable[[], bytes]) -> None:
         """Queues an urgent document that the publishing thread makes: only the latest of each key
@@ -192,7 +189,7 @@ class Publisher:
 
         Opening a session publishes all of them.
         """
-        if self._session is None or self._closing:
+        if self._session is None or self._handover.closing:
             return
         with self._handover.lock:
             self._urgent.pop(key, None)
@@ -204,7 +201,7 @@ class Publisher:
         self._online[device] = online
         if self._session is None:
             return
-        key = self._keys.alive(device)
+        key = self._index.keys.alive(device)
         with self._handover.lock:
             self._waiting["token", device] = (None, key, online)
         self._handover.soon()
@@ -215,10 +212,10 @@ class Publisher:
             self._online.pop(device, None)
 
     def _queue_event(self, key: str, data: Sample | bytes | Callable[[], bytes]) -> None:
-        urgent = key == self._keys.writes
+        urgent = key == self._index.keys.writes
         with self._handover.lock:
             waiting = len(self._urgent) if urgent else self._waiting_events
-            if self._session is None or self._closing or waiting >= EVENTS_LIMIT:
+            if self._session is None or self._handover.closing or waiting >= EVENTS_LIMIT:
                 self._dropped += 1
                 return
             self._waiting_events += not urgent
@@ -231,7 +228,7 @@ class Publisher:
     def stop(self, within: float) -> None:
         """Ends the thread once the queue is empty; waits at most `within` seconds for that."""
         with self._handover.lock:
-            self._closing = True
+            self._handover.closing = True
             self._handover.let_run()
         if self._thread is not None:
             self._thread.join(within)
@@ -279,7 +276,7 @@ class Publisher:
         The caller frees the entries one by one: freeing 50,000 at once holds up the loop for 5 ms.
         """
         with self._handover.lock:
-            while not (self._waiting or self._urgent or self._closing):
+            while not (self._waiting or self._urgent or self._handover.closing):
                 self._handover.rest()
             if self._urgent:
                 waiting, self._urgent = self._urgent, {}

@@ -11,10 +11,10 @@ from pathlib import Path
 import structlog
 
 from gateway import files as disk
-from gateway.config import Config, ConfigErrors, load
+from gateway.config import Config, load
 from gateway.config.changes import Difference, needs_restart
 from gateway.contract.documents.state import ReloadDocument
-from gateway.errors import GatewayError
+from gateway.errors import ConfigError, GatewayError
 from gateway.plant.threads import off_loop
 from gateway.tags.timestamps import rfc3339
 
@@ -29,8 +29,15 @@ _GIT_WITHIN = 5.0  # seconds
 class Reloader:
     """The file of the gateway. `current` is the content that the gateway has taken over."""
 
-    def __init__(self, path: Path, current: Config, wall: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self,
+        path: Path,
+        current: Config,
+        wall: Callable[[], int] = time.time_ns,
+        read: Callable[[Path], Config] = load,
+    ) -> None:
         self.current = current
+        self._load = read
         self.path = path
         self._wall = wall
         self._wanted = asyncio.Event()
@@ -143,8 +150,8 @@ class Reloader:
         """Returns the content of the file, or what is wrong with it."""
         self._note()
         try:
-            config = load(self.path)
-        except ConfigErrors as error:
+            config = self._load(self.path)
+        except ConfigError as error:
             return str(error).splitlines()
         changed = needs_restart(self.current, config)
         return [f"{self.path}: {one} changed: this needs a restart" for one in changed] or config
