@@ -104,3 +104,13 @@ def test_intervals_of_one_device_wait_alike() -> None:
     [fast, slow] = worst_ages(polled_blocks([answering(1, *[0.1] * 10, *[10.0] * 100)]))[::109]
     assert fast > 0.3
     assert slow - fast == pytest.approx(2 * (10.0 - 0.1))
+
+
+def test_what_programs_at_a_door_take_is_part_of_the_load() -> None:
+    blocks = polled_blocks([answering(1, 0.2)])
+    [block] = blocks
+    others = 1.1 - load_of(blocks)
+    [age] = worst_ages(blocks, others)
+    assert age == pytest.approx(2 * block.block.every + 2 * block.seconds)  # as an overloaded line
+    [unhurried] = worst_ages(blocks, others / 10)
+    assert unhurried < age

@@ -6,6 +6,7 @@ import pytest
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
+from gateway.engine.device.long_writes import LongWrite
 from gateway.engine.device.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY, LongerReads
 from gateway.engine.device.reply_shapes import (
     MARK_FIRST,
@@ -367,3 +368,23 @@ def test_a_reload_keeps_what_the_device_is_silent_about() -> None:
     new.plan()
     new.take_over(dev)
     assert [read(shapes_of(new), new, 1.0 + 0.02 * n).size for n in range(6)] == [10] * 6
+
+
+def test_the_forecast_of_two_equal_blocks_has_their_longer_reads() -> None:
+    dev = device([*words(100, 10), *words(500, 10)])
+    [block, _] = dev.blocks
+    found = shapes_of(dev).longer.costs(block)
+    assert found[0] == block.cost
+    assert found[-1].reply > block.cost.reply
+    alone = single()
+    assert shapes_of(alone).longer.costs(alone.blocks[0]) == [alone.blocks[0].cost]
+
+
+def test_acknowledgements_that_name_their_address_are_told_apart() -> None:
+    spans = (Span("D", 0, 2), Span("D", 2, 2))
+    for driver, apart in ((ModbusRtu(station=1), True), (Vigor(station=1), False)):
+        area = "holding" if apart else "D"
+        own = tuple(span._replace(area=area) for span in spans)
+        found = reply_shapes(driver, (), BadAddresses(driver.cost))
+        assert found is not None
+        assert found.tells_apart(LongWrite(driver, own, 0), [1, 2, 3, 4]) is apart

@@ -20,6 +20,7 @@ from gateway.engine.jobs.jobs import (
     Settled,
     Traffic,
 )
+from gateway.engine.jobs.requests import Write
 from gateway.engine.results.busy_devices import FIRST
 from gateway.engine.results.poll_rules import BUSY_PAUSE
 from gateway.errors import DeviceError, Evidence, Garbled, Refusal, Refused, Unsteady
@@ -373,6 +374,23 @@ def test_the_line_waits_for_late_replies_of_online_devices_alone() -> None:
         guards.append(settle.guard)
         rig.conclude(settle, Settled(None))
     assert guards == [rig.device.settings.late_guard, 0.0]
+
+
+def test_after_damaged_replies_the_line_waits_for_the_late_reply_to_a_write_alone() -> None:
+    rig = online(retries=5)
+    rig.fail(rig.transacted(), error=Garbled("noise"))
+    guards = list[float]()
+    for kind in (Poll, Write):
+        if kind is Write:
+            rig.write("D0")
+        while not isinstance(job := rig.transacted(), kind):
+            rig.conclude(job, Resynced(1) if isinstance(job, Probe) else [0] * 6)
+        rig.conclude(job, SILENCE)
+        settle = rig.next()
+        assert isinstance(settle, Settle)
+        guards.append(settle.guard)
+        rig.conclude(settle, Settled(None))
+    assert guards == [0.0, rig.device.settings.late_guard]
 
 
 def test_a_late_reply_is_counted_and_diagnosed_as_slow() -> None:

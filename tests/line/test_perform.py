@@ -24,14 +24,15 @@ from gateway.engine.jobs.jobs import (
     Transacted,
     WriteTogether,
 )
-from gateway.engine.jobs.requests import Command, Write
+from gateway.engine.jobs.requests import Command, Resyncs, Write
 from gateway.errors import BadValue, LineDown, NoReply, Refused, Unclear, Unsteady
 from gateway.line.perform import perform
 from gateway.planning.planner import Block
 from gateway.protocols.computer_link import ComputerLink
-from gateway.protocols.driver import Cost
+from gateway.protocols.driver import Cost, Span
 from gateway.protocols.vigor import Vigor
 from gateway.stations.computer_link import ComputerLinkStation
+from gateway.stations.vigor import VigorStation
 from gateway.tags import Tag, WriteRule
 from tests.doubles import Script, Wire, result_of
 from tests.line.fake_port import FakePort, opened
@@ -140,6 +141,30 @@ def test_a_write_is_one_request() -> None:
     assert plc.perform(plc.write("D5", [42])) == Sent(acknowledged=True, held=None)
     assert plc.commands == ["WW"]
     assert plc.words(5) == [42]
+
+
+def test_a_refused_resync_after_a_write_is_followed_by_the_last_good_read() -> None:
+    vigor, station = Vigor(station=1), VigorStation(1)
+    read, last = [0], Span("D", 9, 3)
+    of_last = Wire(vigor, lambda data: station.hear(data, 0.0))
+    result_of(vigor.read(cast(Any, of_last), last))
+
+    def respond(data: bytes) -> list[bytes]:
+        if data[3:5] == b"51":
+            read[0] += 1
+            station.memory.guard = (lambda *_: True) if data != of_last.sent[0] else None
+        else:
+            station.memory.guard = None
+        return station.hear(data, 0.0)
+
+    dev = made_device("plc", vigor, WIRE, vigor.timing, (make_tag("D9", vigor),))
+    dev.good_reads.note(last)
+    write = Write(dev, make_tag("D9", vigor, write=WriteRule()), [42], 0.0)
+    write.resyncs = Resyncs(after=2)
+    wire = Wire(vigor, respond)
+    assert result_of(perform(write, cast(Any, wire))) == Sent(acknowledged=True)
+    assert wire.sent[-1] == of_last.sent[0]
+    assert read[0] > 1  # the resync was refused before
 
 
 def test_a_verified_write_is_read_back() -> None:
