@@ -106,7 +106,7 @@ def parquet_store() -> Iterator[tuple[Store, Callable[[], None]]]:
             queries(
                 lambda query: duckdb.execute(query).fetchall(),
                 table=files,
-                day="date_trunc('day', time)",
+                day="date",
                 hour="date_trunc('hour', time)",
                 of_gateway="AND gateway = 'plant,g7'",
             )

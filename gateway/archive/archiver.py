@@ -78,7 +78,8 @@ class Follower:
     async def _store(self, page: Page) -> None:
         before, now = self.cursor, time.time_ns() // 1000
         is_other = file_of(before.after) not in ("", page.file)
-        after = replace(before, after=page.next, overlaps=before.overlaps or is_other)
+        may_overlap = before.overlaps or is_other or page.lost is not None
+        after = replace(before, after=page.next, overlaps=may_overlap)
         for why in self._gaps(page, is_other=is_other):
             first = min((row.time for row in page.rows), default=None)
             gap = Gap(

@@ -163,3 +163,22 @@ async def test_what_was_deleted_before_it_was_read_is_told(tmp_path: Path) -> No
         assert found[0] == f"{TAGS[0].key} {IN_RUN}"
         found, end = await page(client, f"{begin};after={end['next']}")
         assert "damaged" not in end
+
+
+async def test_a_disk_of_an_earlier_day_is_read_from_the_beginning(tmp_path: Path) -> None:
+    """The file is the same one, with the same mark: its numbers are given to other samples."""
+    endpoint, path = free_endpoint(), tmp_path / "h.db"
+    recorded(path)
+    begin = "plant/@gateway/demo/page?_time=[..];page=100000"
+    async with serving(tmp_path, endpoint), ZenohPeer("client", connect=[endpoint]) as client:
+        assert len((await page(client, begin))[0]) == RUNS * IN_RUN
+        _, end = await page(client, begin)
+    with closing(sqlite3.connect(path)) as database, database:
+        for table in ("sample", "run"):
+            database.execute(f"DELETE FROM {table} WHERE id > {2 * IN_RUN}")  # noqa: S608
+    async with serving(tmp_path, endpoint), ZenohPeer("client", connect=[endpoint]) as client:
+        found, end = await page(client, f"{begin};after={end['next']}")
+        assert len(found) == 2 * IN_RUN
+        assert end["damaged"] == "the file is an older copy: it is read from its beginning"
+        found, end = await page(client, f"{begin};after={end['next']}")
+        assert (found, "damaged" in end) == ([], False)

@@ -106,12 +106,13 @@ class Search:
         tags = query.tags
         file, sorted_runs, newest = self._recent.content()
         mark = _mark(file)
-        (_, begin, first), period = _start(query.after, mark, period)
+        places = [run.number for run in sorted_runs] + [number for number, *_ in newest if number]
+        (_, begin, first), period = _start(query.after, mark, period, places)
         stored = StoredRuns(self._reader, self.damage, file, period)
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
         place, found = (mark, begin, max(first - 1, 0)), False
-        yield from _deleted(sorted_runs, newest, place if first else None)
+        yield from _missed(query.after, place, places)
         for run in runs:
             skipped = first if run.number == begin else 0
             if skipped < run.samples and stored.of([run]):
@@ -233,13 +234,20 @@ def _found(
             pause()
 
 
-def _deleted(
-    runs: Sequence[SortedRun], newest: Sequence[tuple[int, list[Sample], int]], after: Place | None
-) -> Recorded:
-    """Yields `Damaged` if samples after the place were deleted to make room."""
-    numbers = [*(run.number for run in runs[:1]), *(number for number, _, _ in newest if number)]
-    if after is not None and numbers and (count := numbers[0] - after[1] - after[2] - 1) > 0:
-        yield Damaged(f"{count} samples were deleted unread"), after
+def _missed(after: Place | None, begin: Place, runs: Sequence[int]) -> Recorded:
+    """Yields `Damaged` if samples after the place were deleted to make room, or are others now."""
+    if after is None or after[0] != begin[0] or not runs:
+        return
+    if not _is_known(after, runs):
+        yield Damaged("the file is an older copy: it is read from its beginning"), begin
+    elif (count := runs[0] - after[1] - after[2] - 1) > 0:
+        yield Damaged(f"{count} samples were deleted unread"), begin
+
+
+def _is_known(place: Place, runs: Sequence[int]) -> bool:
+    """Returns False if the file had the run, and has only earlier and later ones now: the disk is
+    that of an earlier day."""
+    return place[1] in runs or all(run > place[1] for run in runs)
 
 
 def _mark(file: Identity | None) -> str:
@@ -247,10 +255,12 @@ def _mark(file: Identity | None) -> str:
     return "" if file is None else f"{file.inode:x}.{file.mark[:4].hex()}"
 
 
-def _start(after: Place | None, mark: str, period: TimeRange) -> tuple[Place, TimeRange]:
+def _start(
+    after: Place | None, mark: str, period: TimeRange, runs: Sequence[int]
+) -> tuple[Place, TimeRange]:
     """Returns the first place and the period of a search. The clock may have been set back since
     `after`."""
-    if after is None or after[0] != mark:
+    if after is None or after[0] != mark or not _is_known(after, runs):
         return (mark, 0, 0), period
     return (mark, after[1], after[2] + 1), TimeRange(EARLIEST, period.last)
 
