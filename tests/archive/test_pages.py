@@ -1,0 +1,89 @@
+"""Answers to the archiver that are not whole, or from another program."""
+
+import asyncio
+import json
+from collections.abc import Callable
+
+import pytest
+import zenoh
+
+from gateway.archive.pages import History, Page, file_of
+from gateway.errors import GatewayError
+from tests.zenoh_peer import configured, free_endpoint
+
+DEMO = "plant/@gateway/demo"
+SAMPLE = {"value": 1, "quality": "good", "time": "2026-11-26T12:00:00Z"}
+END = {"samples": 2, "complete": True, "next": "demo:1f.a0-1-2"}
+
+
+def told(query: zenoh.Query, *documents: object) -> None:
+    """Replies with samples, and with a last document on the key of the query."""
+    *samples, end = (json.dumps(document) for document in documents)
+    for sample in samples:
+        query.reply("plant/mixer/speed", sample)
+    query.reply(f"{DEMO}/page", end)
+
+
+def refuses(query: zenoh.Query) -> None:
+    query.reply_err(json.dumps({"error": "busy", "reason": "later"}))
+
+
+def twice(query: zenoh.Query) -> None:
+    """As two gateways do."""
+    for _ in range(2):
+        told(query, END)
+
+
+async def asked(answer: Callable[[zenoh.Query], None]) -> Page:
+    endpoint = free_endpoint()
+    here = {"mode": "peer", "listen": [endpoint], "connect": [], "config": {}}
+    there = {"mode": "client", "listen": [], "connect": [endpoint], "config": {}}
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            answer(query)
+
+    with zenoh.open(configured(here)) as gateway:
+        gateway.declare_queryable(f"{DEMO}/**", reply)
+        with await asyncio.to_thread(zenoh.open, configured(there)) as session:
+            return await History(session, DEMO).page("", 10)
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        (lambda _: None, "it does not answer"),
+        (refuses, "busy: later"),
+        (lambda query: told(query, SAMPLE, END), "1 of 2 samples have arrived"),
+        (twice, "2 gateways have this name: rename"),
+        (lambda query: told(query, SAMPLE, {"samples": 1}), "its answer is none of a gateway"),
+        (lambda query: told(query, [1]), "its answer is none of a gateway"),
+        (
+            lambda query: told(query, SAMPLE, SAMPLE, END | {"next": "demo:-0-0"}),
+            "its history is not ready",
+        ),
+    ],
+)
+async def test_an_answer_that_is_not_whole_is_refused(
+    answer: Callable[[zenoh.Query], None], why: str
+) -> None:
+    with pytest.raises(GatewayError, match=why):
+        await asked(answer)
+
+
+async def test_what_is_no_sample_is_counted_and_what_comes_again_is_left_out() -> None:
+    page = await asked(
+        lambda query: told(
+            query, SAMPLE, {"no": "sample"}, SAMPLE | {"value": 2}, END | {"samples": 3, "again": 1}
+        )
+    )
+    assert [row.value for row in page.rows] == [1.0]
+    assert (page.strange, page.is_last, page.is_whole, page.file) == (1, True, False, "1f.a0")
+
+
+def test_the_mark_of_a_file_is_in_a_place() -> None:
+    assert [file_of(place) for place in ("", "de-mo:1f.a0-4711-12", "demo:-0-0")] == [
+        "",
+        "1f.a0",
+        "",
+    ]
