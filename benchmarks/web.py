@@ -27,6 +27,7 @@ from gateway.config import Config, load
 from gateway.contract import payload
 from gateway.contract.faults import Documents
 from gateway.northbound.requests.audit import Counts
+from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Who
 from gateway.parts.web.events import WIRE_EVERY, Events, Page
 from gateway.parts.web.line_past import Loads
@@ -97,7 +98,7 @@ def core_of(gateway: Plant, north: Any) -> Core:
 async def show(core: Core, made: list[float]) -> None:
     """Makes the events of one page. Adds the processor time of each to `made`."""
     tags, loads, client = TagList(core.plant, ()), Loads(core), Who("", may_write=False)
-    events = Events(core, tags, loads, lambda _: client)
+    events = Events(core, tags, loads, lambda _: client, Api(core, tags).past)
     measuring = asyncio.create_task(loads.run())
     try:
         with events.wires.watched("line0") as recorder:

@@ -22,7 +22,7 @@ QUESTIONS = {
     "unknown line": "operations",
     "import excel": "import",
     "first plant": "first-plant",
-    "opc ua": "integrate",
+    "opc ua": "opcua",
     "home assistant": "integrate",
     "ros 2": "integrate",
     "docker": "deployment",

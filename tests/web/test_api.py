@@ -227,15 +227,18 @@ async def test_a_body_that_does_not_arrive_is_not_waited_for(
         assert client.north.written == []
 
 
-async def events(client: Client, query: str) -> "dict[str, Any]":
-    """The first event of each kind."""
+async def events(client: Client, query: str, last: str = "") -> "dict[str, Any]":
+    """The first event of each kind, and `id`. `last`: of the header Last-Event-ID."""
     reader, writer = await asyncio.open_connection("127.0.0.1", client.port)
     found: dict[str, Any] = {}
     try:
-        writer.write(f"GET /api/events?{query} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        head = f"Host: 127.0.0.1\r\nLast-Event-ID: {last}\r\n\r\n"
+        writer.write(f"GET /api/events?{query} HTTP/1.1\r\n{head}".encode())
         async with asyncio.timeout(300):
             while "time" not in found:
                 line = await reader.readline()
+                if line.startswith(b"id: "):
+                    found["id"] = line[4:].strip().decode()
                 if line.startswith(b"event: "):
                     kind = line[7:].strip().decode()
                     found[kind] = json.loads((await reader.readline()).removeprefix(b"data: "))
@@ -258,6 +261,25 @@ async def test_the_page_gets_large_integers_as_text_and_no_text_of_a_bad_value()
         "silent",
         "No byte came back: check power, wiring and station number",
     ]
+
+
+async def test_a_client_that_comes_again_gets_what_it_missed(tmp_path: Path) -> None:
+    now = time.time_ns()
+    plant = PlainPlant(PlainDevice(SPEED.device, (SPEED, tag(SPEED.device, "without"))))
+    with history(tmp_path / "history.db") as historian:
+        historian.record([good(SPEED, number, now - (5 - number) * 10**9) for number in range(5)])
+        async with serving(history=historian, plant=plant) as client:
+            first = await events(client, f"tags={SPEED.device}/*")
+            assert "missed" not in first
+            assert abs(int(first["id"]) - time.time() * 1000) < 300_000
+            since = str(now // 10**6 - 2_500)
+            again = await events(client, f"tags={SPEED.device}/*", since)
+            assert list(again)[:2] == ["missed", "state"]
+            assert again["missed"]["tag"] == SPEED.key
+            assert [one["value"] for one in again["missed"]["samples"]] == [3, 4]
+            assert again["missed"]["complete"] is True
+            for odd in ("x", "-1", "9" * 30):
+                assert "missed" not in await events(client, f"tags={SPEED.device}/*", odd)
 
 
 async def test_a_line_is_watched_only_while_a_page_shows_it() -> None:

@@ -40,7 +40,8 @@ async def test_pages_of_a_listed_origin_may_read_and_write_with_a_token(tokens: 
             "/api/write", "OPTIONS", Origin=hmi, Access_Control_Request_Method="POST"
         )
         assert (asked.status, asked.headers[allowed]) == (204, hmi)
-        assert asked.headers["Access-Control-Allow-Headers"] == "authorization, content-type"
+        headers = "authorization, content-type, last-event-id"
+        assert asked.headers["Access-Control-Allow-Headers"] == headers
         ask = partial(client.ask, "/api/tags", Origin=hmi, Sec_Fetch_Site="cross-site")
         refused = await ask()
         assert (refused.status, refused.headers[allowed]) == (401, hmi)  # its page sees why

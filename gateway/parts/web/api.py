@@ -255,16 +255,25 @@ class Api:
         if tag is None:
             return answer(404, f"there is no tag {payload.short(key)}")
         try:
-            history = self._core.history()
-        except Busy as error:
-            return answer(503, str(error))
-        if history is None or not tag.publishing.history:
+            found = await self.past(request, tag, dict(request.query), _SAMPLES.of(request))
+        except GatewayError as error:
+            return answer(400 if isinstance(error, BadValue) else 503, str(error))
+        if found is None:
             return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
-        limit = _SAMPLES.of(request)
-        find = partial(_found, history, tag, dict(request.query), limit)
+        return await json_off_loop(lambda: found)
+
+    async def past(
+        self, request: web.Request, tag: Tag, parameters: Mapping[str, str], limit: int
+    ) -> dict[str, object] | None:
+        """Returns samples or buckets of a tag; None if no history is kept of it. Raises
+        `GatewayError`, and `HTTPServiceUnavailable` if too many wait."""
+        history = self._core.history()
+        if history is None or not tag.publishing.history:
+            return None
+        find = partial(_found, history, tag, parameters, limit)
         is_valid = has_value(self._plant.sample(tag))
 
-        def read() -> object:
+        def read() -> dict[str, object] | GatewayError:
             try:
                 return find(Now(time.time_ns(), is_valid=is_valid))
             except GatewayError as error:
@@ -274,8 +283,8 @@ class Api:
             async with self._history_turns:
                 found = await off_loop(read)
         if isinstance(found, GatewayError):
-            return answer(400 if isinstance(found, BadValue) else 503, str(found))
-        return await json_off_loop(lambda: found)
+            raise found
+        return found
 
     async def _write(self, request: web.Request) -> web.Response:
         arrived = asyncio.get_running_loop().time()

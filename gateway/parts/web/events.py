@@ -1,6 +1,7 @@
 """Server-sent events for the status page: state, chosen values, exchanges of one line.
 
-Nothing is queued for a client. Each event is made from the current state when the client has taken
+A client that comes again gets the samples since its last event from the history. Nothing else is
+queued for a client. Each event is made from the current state when the client has taken
 the one before, so a slow client gets fewer events, and none that is old. A client that takes
 nothing for `SLOW` seconds is dropped.
 """
@@ -8,7 +9,7 @@ nothing for `SLOW` seconds is dropped.
 import asyncio
 import time
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +18,7 @@ from aiohttp import web
 
 from gateway.contract import payload
 from gateway.contract.faults import Documents, below, causes, transfers
+from gateway.errors import GatewayError
 from gateway.parts.web.api import overview
 from gateway.parts.web.connections import Places, Who
 from gateway.parts.web.line_past import Loads
@@ -26,6 +28,7 @@ from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample, Tag
+from gateway.tags.timestamps import rfc3339
 
 MOST_PAGES = 20  # and of one client
 MOST_PAGES_OF_CLIENT = 16
@@ -33,6 +36,11 @@ SLOW = 5.0  # seconds
 WIRE_EVERY = 0.25  # seconds between two events with exchanges
 VALUES_EVERY = 1.0
 STATE_EVERY = 2.0
+OVERLAP = 1.0  # seconds before an event that are replayed after it, too
+MOST_MISSED = 1_000  # samples of one tag that are replayed
+MOST_DIGITS = 14  # of an id: ms since 1970
+# Of a request, a tag, the parameters of `/api/history` and a limit.
+Past = Callable[[web.Request, Tag, Mapping[str, str], int], Awaitable[dict[str, object] | None]]
 _BY_NAME = ("devices", "transfers", "timelines")  # of the state: a page gets their changes
 MOST_SENTENCES = 50  # about what is wrong, and about what to look at
 _LINE = Word("line", "With the exchanges of this line")
@@ -43,9 +51,15 @@ class Events:
     """The handler of `/api/events`."""
 
     def __init__(
-        self, core: Core, tags: TagList, loads: Loads, who: Callable[[web.Request], Who | None]
+        self,
+        core: Core,
+        tags: TagList,
+        loads: Loads,
+        who: Callable[[web.Request], Who | None],
+        past: Past,
     ) -> None:
-        """`who`: the client; None when its token was withdrawn."""
+        """`who`: the client; None when its token was withdrawn. `past`: of `Api`."""
+        self._past = past
         self._core = core
         self._tags = tags
         self.loads = loads
@@ -83,9 +97,25 @@ class Events:
             response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
             response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
             await response.prepare(request)
+            async for event in self._missed(request, tags):
+                await response.write(event)
             page = Page(self._core, self, tags, recorder)
             await _send(request, response, page, self._who)
         return response
+
+    async def _missed(self, request: web.Request, tags: Sequence[Tag]) -> AsyncIterator[bytes]:
+        """Yields what the history has since the last event of a client that comes again."""
+        last = request.headers.get("Last-Event-ID", "")
+        if not (last.isascii() and last.isdigit() and len(last) <= MOST_DIGITS):
+            return
+        since = {"time": f"[{rfc3339(int(last) * 10**6)}..]"}
+        for tag in tags:
+            try:
+                found = await self._past(request, tag, since, MOST_MISSED)
+            except (GatewayError, web.HTTPServiceUnavailable) as error:
+                found = {"tag": tag.key, "error": str(error)}
+            if found is not None:
+                yield _event("missed", found)
 
 
 async def _send(
@@ -135,7 +165,8 @@ class Page:
                 self._load = loads.number
         if self._values_due <= loop.time():
             self._values_due = loop.time() + VALUES_EVERY
-            events.append(_event("values", self._values(self._tags)))
+            number = int((time.time() - OVERLAP) * 1000)
+            events.append(_event("values", self._values(self._tags), number))
         if self._recorder is not None and (new := self._recorder.since(self._exchange)):
             missed = new[0].number - self._exchange - 1 if self._exchange else 0
             self._exchange = new[-1].number
@@ -231,5 +262,6 @@ def _changes(known: Mapping[str, object], now: Mapping[str, object]) -> dict[str
     return changed | dict.fromkeys(known.keys() - now.keys())
 
 
-def _event(kind: str, data: object) -> bytes:
-    return b"event: %b\ndata: %b\n\n" % (kind.encode(), payload.document(data))
+def _event(kind: str, data: object, number: int | None = None) -> bytes:
+    after = b"" if number is None else b"id: %d\n" % number
+    return b"event: %b\ndata: %b\n%b\n" % (kind.encode(), payload.document(data), after)

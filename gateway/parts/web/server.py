@@ -44,7 +44,7 @@ class Server:
         self._loads = Loads(core)
         connections = Connections()
         guard = Guard(config, connections)
-        events = Events(core, tags, self._loads, guard.who)
+        events = Events(core, tags, self._loads, guard.who, self._api.past)
         routes = [
             *self._api.routes(),
             *AlarmApi(core).routes(),

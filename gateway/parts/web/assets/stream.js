@@ -170,7 +170,7 @@ async function read(body, mine) {
     rest = events.pop();
     for (const event of events) {
       if (stream !== mine) return;
-      const [, kind, data] = event.match(/^event: (\w+)\ndata: (.*)$/s) ?? [];
+      const [, kind, data] = event.match(/^event: (\w+)\ndata: (.*)$/m) ?? [];
       if (kind === "time") takeTime(JSON.parse(data));
       else if (kind) for (const taker of takers[kind] ?? []) taker(JSON.parse(data));
     }
