@@ -16,7 +16,7 @@ from tests.zenoh_peer import free_endpoint, free_port
 
 SECRET = 2 * "0123456789abcdef"
 WRITER = {"PLC_GATEWAY_WRITER": f"ana:{SECRET}"}
-QUICK = ("--wait", "1s", "--look", "1s", "--within", "10s")
+QUICK = ("--wait", "1s", "--look", "1s", "--within", "5min")
 TEMPLATE = """\
 # The pumping station ${name}
 gateway: {name: ${name}}
@@ -29,7 +29,7 @@ lines:
   hall:
     port: ${port}
     devices:
-      pump-${name}: {use: pump, base: ${base}, protocol: vigor, station: ${station}}
+      pump-${name}: {use: pump, base: ${base}, protocol: vigor, station: ${station}, ${slow}}
 """
 
 
@@ -59,7 +59,7 @@ class Plant:
         """Writes the files: every pump at `D<base>`, and other cells of gateway b."""
         rows = {
             name: {"name": name, "area": "north", "router": self.endpoint, "every": "200ms"}
-            | {"port": "simulator", "base": base, "station": 1}
+            | {"port": "simulator", "base": base, "station": 1, "slow": "reply_timeout: 2s"}
             for name in "abc"
         }
         rows["b"] |= {"port": f"tcp://127.0.0.1:{self.port}", **of_b}
@@ -174,21 +174,23 @@ def test_a_second_rollout_is_refused_while_a_file_waits(plant: Plant) -> None:
 def test_a_partition_in_the_middle_of_a_rollout(plant: Plant) -> None:
     """The gateway puts its file back by itself. The next run goes on with it."""
     plant.render(4)
-    rollout = [*("fleet", "works", "apply", plant.files, "--connect", plant.endpoint), *QUICK[:2]]
-    within = ("--canary", 2, "--look", "5s", "--within", "10s")
+    alone = plant.folder / "alone"
+    alone.mkdir()
+    shutil.copy(plant.files / "c.yaml", alone)
+    pace = ("--canary", 0, "--look", "10s", "--within", "10s")
     c = plant.programs["c"]
-    with gateway(*rollout, *within, variables=writer()) as first:
-        lines = len(c.lines)
+    lines = len(c.lines)
+    rollout = ("fleet", "works", "apply", alone, "--connect", plant.endpoint, *pace)
+    with gateway(*rollout, variables=writer()) as first:
         c.says("file taken over", after=lines)
         plant.between.close()
         assert first.ended() == 1
-        assert first.has_said("works/south/c: lost: no answer since it loaded the file")
-        assert first.has_said("2 have the new file")
+        assert first.has_said("works/south/c: lost: ")
     c.says("file went back", after=lines)
     assert "base: 1," in plant.own("c").read_text()
     done, found = plant.apply()
-    assert (done.code, results(found)) == (1, ["same", "same", "unreachable"])
+    assert (done.code, results(found)) == (1, ["confirmed", "confirmed", "unreachable"])
+    assert "2 have the new file" in done.err
     with router(plant.other, connect=plant.endpoint):
-        c.says("Zenoh link up", after=len(c.lines) - 1)
         until(lambda: plant.apply()[0].code == 0, "c has its file")
     assert "base: 4," in plant.own("c").read_text()

@@ -43,11 +43,11 @@ class Requests:
         self._query = query
         self._user = user
 
-    def order(self, path: str, order: Mapping[str, object]) -> dict[str, object]:
-        """Returns the document of `alarms/<alarm>` or `doors/<door>` then, or `error ...`. Raises
-        as `write`."""
+    def order(self, path: str, order: Mapping[str, object], more: float = 0.0) -> dict[str, object]:
+        """Returns the document of `alarms/<alarm>` or `doors/<door>` then, or `error ...`. `more`:
+        seconds that the answer may take longer than others. Raises as `write`."""
         status = self._keys.status("status")
-        return self._request(self._keys.status(path), json.dumps(order).encode(), status)
+        return self._request(self._keys.status(path), json.dumps(order).encode(), status, more)
 
     def write(self, tag: str, value: Value | dict[str, Value]) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.

@@ -9,12 +9,11 @@ import typer
 
 from gateway import files
 from gateway.cli.client import Client, reached
+from gateway.cli.fleet.rollout import KEY, LOADING
 from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
 from gateway.config.settings.parsers import interval
 from gateway.contract.faults import faults
 from gateway.errors import ConfigError
-
-_KEY = "remote/file"
 
 
 def remote(
@@ -37,7 +36,7 @@ def remote(
     looks, order = interval(look), _order(new, rollback, check=check, revert=revert)
     with reached(config, err.print) as client:
         if order is None:
-            print(json.dumps(client.status(_KEY)))
+            print(json.dumps(client.status(KEY)))
             return
         before = _faults(client)
         if order["do"] in ("apply", "rollback"):
@@ -80,7 +79,7 @@ def _order(
 
 
 def _sent(client: Client, order: dict[str, Any]) -> dict[str, Any]:
-    answer = client.requests.order(_KEY, order)
+    answer = client.requests.order(KEY, order, LOADING)
     if "error" in answer:
         end(printable(str(answer["reason"])), FAILED)
     return answer

@@ -15,6 +15,7 @@ from gateway.errors import GatewayError
 
 KEY = "remote/file"
 RESERVE = 5.0  # seconds before a file goes back in which it is no longer confirmed
+LOADING = 50.0  # seconds that a large gateway may take longer to load a file
 LOOK_EVERY = 10.0  # seconds
 _AGAIN = 1.0  # seconds after a look that found no answer, or devices that are not up yet
 
@@ -114,7 +115,7 @@ class Rollout:
 
     def _checked(self, name: str) -> Ended:
         try:
-            answer = self._client.of(name).requests.order(KEY, self._steps[name].order)
+            answer = self._client.of(name).requests.order(KEY, self._steps[name].order, LOADING)
         except GatewayError as error:
             return Ended(name, Result.UNREACHABLE, str(error))
         if "error" in answer:
@@ -137,7 +138,7 @@ class Rollout:
             return Ended(name, Result.UNREACHABLE, str(error))
         began = time.monotonic()
         until = began + look + within - RESERVE
-        change = self._loaded(one, step, look + within)
+        change = self._loaded(one, step, look + within, until)
         if isinstance(change, tuple):
             return Ended(name, *change)
         is_other = change["digest"] != step.digest
@@ -158,16 +159,17 @@ class Rollout:
         return Ended(name, Result.BACK, f"{back}: {self._why}")
 
     def _loaded(
-        self, one: Client, step: Step, confirm: float
+        self, one: Client, step: Step, confirm: float, until: float
     ) -> RemoteDocument | tuple[Result, str]:
         """Returns the change that waits, or why none does."""
         try:
-            answer = one.requests.order(KEY, {**step.order, "confirm": confirm})
+            answer = one.requests.order(KEY, {**step.order, "confirm": confirm}, LOADING)
             if "error" in answer:
                 return Result.REFUSED, str(answer["reason"])
             return read_remote(answer)
         except GatewayError as error:  # it may have loaded the file
-            change = self._state(one)
+            while (change := self._state(one)) is None and time.monotonic() < until:
+                time.sleep(_AGAIN)
             if change is not None and change["state"] == "waiting":
                 return change
             return Result.LOST, f"{error}; if it loaded the file, it goes back by itself"
