@@ -39,7 +39,6 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 PREFIX, EVERY_OTHER = "works", 97  # one gateway of so many runs another file
 BAD_STATION = 31
-BACK_AFTER = 60.0  # seconds
 FILE = """\
 gateway: {{name: g{number}}}
 writers: {{file: writers.txt}}
@@ -223,13 +222,13 @@ class Bench:
             if "digest" in row
         }
 
-    def unconfirmed(self) -> dict[str, float]:
+    def unconfirmed(self, back: float) -> dict[str, float]:
         """Gives every gateway a bad file, and confirms none. Returns when each goes back."""
 
         def give(number: int) -> tuple[str, float]:
             text = file_of(number, 9003, BAD_STATION)
             name = key_of(number).replace("/@gateway/", "/")
-            order = {"do": "apply", "file": text, "confirm": BACK_AFTER}
+            order = {"do": "apply", "file": text, "confirm": back}
             one, until = client.of(name), None
             while until is None:
                 with suppress(GatewayError):  # no reply in time: it may have loaded the file
@@ -264,10 +263,10 @@ async def changed(bench: Bench) -> None:
     print(f"the same again: {counts['same']} the same, in {took:.1f} s", flush=True)
 
 
-async def back_by_itself(bench: Bench) -> None:
+async def back_by_itself(bench: Bench, back: float) -> None:
     before = await bench.digests()
     began = time.monotonic()
-    until = await asyncio.to_thread(bench.unconfirmed)
+    until = await asyncio.to_thread(bench.unconfirmed, back)
     given = time.monotonic() - began
     await asyncio.sleep(max(0.0, max(until.values()) - time.time()))
     while (after := await bench.digests()) and any(
@@ -306,6 +305,7 @@ async def main() -> None:
     parser.add_argument("--gateways", type=int, default=1000)
     parser.add_argument("--processes", type=int, default=4)
     parser.add_argument("--parallel", type=int, default=100)
+    parser.add_argument("--back", type=float, default=60.0, help="seconds of the bad file")
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:
@@ -339,7 +339,7 @@ async def main() -> None:
             await process.stdout.readline()
         await seen(bench, first)
         await changed(bench)
-        await back_by_itself(bench)
+        await back_by_itself(bench, given.back)
         await parted(bench, routers[0], partial(router, 0))
         running[0].kill()
         await running[0].wait()

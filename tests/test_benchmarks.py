@@ -43,7 +43,7 @@ TINY = [
     ("encodings", "", [r"^\| a value \| 68 \| 57 \(84%\) \|"]),
     (
         "fleet",
-        "--gateways 4 --processes 2",
+        "--gateways 4 --processes 2 --back 10",
         [
             r"^4 of 4 gateways in [\d.]+ s",
             r"^files that differ: 1 named, 0 ",
