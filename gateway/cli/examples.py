@@ -5,6 +5,7 @@ from collections.abc import Mapping
 # A command that takes one argument at most has one.
 EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "run": ("plant.yaml", "plant.yaml --log-format json"),
+    "demo": ("", "--no-browser"),
     "check": ("plant.yaml", "plant.yaml --strict --json"),
     "read": ("plant.yaml mixer", "plant.yaml mixer/speed --direct"),
     "write": ("plant.yaml mixer/recipe 7", "plant.yaml mixer recipe=7 speed=12.5"),

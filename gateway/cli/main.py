@@ -24,6 +24,7 @@ from gateway.parts import registry
 # Module and function of each command, in the order of `--help`.
 _COMMANDS = {
     "run": "run:run",
+    "demo": "config.demo:demo",
     "check": "config.check:check",
     "read": "read:read",
     "write": "write:write",
@@ -116,7 +117,7 @@ def main() -> None:
     """Runs the command of `sys.argv`. Exit codes: 0 success, 1 failure, 2 the user's mistake."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # the search takes 25 ms
     gc.set_threshold(GC_EVERY)
-    if sys.argv[1:2] == ["run"]:  # the service takes it, when it has begun
+    if sys.argv[1:2] in (["run"], ["demo"]):  # the service takes it, when it has begun
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

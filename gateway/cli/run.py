@@ -48,11 +48,11 @@ def run(
     if log_format is LogFormat.TEXT:
         with progress(err) as report:
             loaded = read(config, report)
-        _serve(loaded, config, set_up(log_format, log_level), read)
+        serve(loaded, config, set_up(log_format, log_level), read)
     else:
         set_up(log_format, log_level)  # first: a mistake in the file is a document too
         try:
-            _serve(read(config), config, lambda _text: None, read)
+            serve(read(config), config, lambda _text: None, read)
         except GatewayError as error:
             for sentence in str(error).splitlines():
                 log.error("gateway failed", why=sentence)  # noqa: TRY400  (a sentence, no trace)
@@ -76,9 +76,13 @@ def _loaded(
     return config
 
 
-def _serve(
-    config: Config, path: Path, say: Callable[[str], None], read: Callable[[Path], Config]
+def serve(
+    config: Config, path: Path, say: Callable[[str], None], read: Callable[[Path], Config] = load
 ) -> None:
+    """Runs the gateway of a file until it is stopped. `say` gets what to try, when it is ready.
+
+    `read` loads the file again.
+    """
     tags = sum(len(device.tags) for device in config.devices)
     log.info(
         "gateway starting",

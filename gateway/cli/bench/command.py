@@ -2,7 +2,6 @@
 
 import asyncio
 import signal
-import socket
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -12,6 +11,7 @@ from typing import Annotated
 import typer
 
 from gateway.cli.bench.api import BenchApi, Entry
+from gateway.cli.config.demo import free_port
 from gateway.cli.config.new import LISTEN
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.simulate import stop_event
@@ -93,9 +93,4 @@ async def serve(api: BenchApi, at: int, tell: Callable[[str], None]) -> None:
 
 def _free_endpoint() -> str:
     """Returns the usual endpoint of Zenoh in a new file, or a free one if it is taken."""
-    usual = int(LISTEN.rpartition(":")[2])
-    for port in (usual, 0):
-        with socket.socket() as probe, suppress(OSError):
-            probe.bind((_HOST, port))
-            return f"tcp/{_HOST}:{probe.getsockname()[1]}"
-    return LISTEN
+    return f"tcp/{_HOST}:{free_port(int(LISTEN.rpartition(':')[2]))}"
