@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -39,7 +39,6 @@ PATIENCE = 180.0  # seconds for the first values
 QUIET = 0.1  # cores that other programs may use in a quiet run
 TREE = Path(os.environ.get("GATEWAY_TREE", HERE))  # another checkout, to compare
 TICKS = os.sysconf("SC_CLK_TCK")
-BEGIN, END = "<!-- scenarios -->", "<!-- end of scenarios -->"
 
 
 class Scenario(NamedTuple):
@@ -387,8 +386,7 @@ def table(results: dict[str, Any]) -> str:
     ]
     for one in results["scenarios"]:
         values, writes, start = one["values"], one["writes"], one["start"]
-        wrong = sum(values[name] for name in ("wrong", "wrong time", "out of order"))
-        wrong += writes["lost"] + writes["failed"]
+        wrong = _wrong(one)
         each = "" if one["us_per_value"] is None else f"{one['us_per_value']:.1f}"
         note = f" (others used {one['load']['others']} cores)" if one["loaded"] else ""
         rows.append(
@@ -402,10 +400,59 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def _read(one: dict[str, Any]) -> int:
+    return max(1, int(one["values"]["read"]))
+
+
+def _wrong(one: dict[str, Any]) -> int:
+    found = sum(one["values"][name] for name in ("wrong", "wrong time", "out of order"))
+    return int(found + one["writes"]["lost"] + one["writes"]["failed"])
+
+
+class Aim(NamedTuple):
+    """A figure of 100,000 values, and its greatest value on two quiet cores."""
+
+    name: str
+    changing: bool
+    most: float
+    of: Callable[[dict[str, Any]], float]
+
+
+AIMS = (
+    Aim("values stay: cores", False, 0.10, lambda one: one["cores"]),
+    Aim("values stay: MB", False, 160, lambda one: one["MB"]),
+    Aim("start: s of processor", False, 5, lambda one: one["start"]["processor"]),
+    Aim("values change: cores", True, 0.8, lambda one: one["cores"]),
+    Aim("missing of 1,000", True, 0, lambda one: 1000 * one["values"]["missing"] / _read(one)),
+    Aim("wrong, or a write lost", True, 0, _wrong),
+    Aim("writes beside it: p99, ms", True, 20, lambda one: 1000 * one["writes"]["p99"]),
+)
+
+
+def aims(results: dict[str, Any]) -> str:
+    """Returns the table of the aims, without rows that the results have not."""
+    rows = ["| 100,000 values at 1 s | aim | measured | |", "|---|---|---|---|"]
+    name = SCENARIOS["100k"].name
+    found = {one["changing"]: one for one in results["scenarios"] if one["name"] == name}
+    for aim in AIMS:
+        if (one := found.get(aim.changing)) is None:
+            continue
+        value, load = aim.of(one), one["load"]
+        words = ["met" if value <= aim.most else "missed"]
+        if one["loaded"]:
+            queue = load["run_queue"]
+            words += [f"others used {load['others']} cores, {queue:.0f} programs ran or waited"]
+        rows.append(f"| {aim.name} | {aim.most:g} | {value:.4g} | {'; '.join(words)} |")
+    return "\n".join(rows)
+
+
 def into_page(results: dict[str, Any]) -> None:
-    before, rest = PAGE.read_text().split(BEGIN)
-    after = rest.split(END)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n{table(results)}\n{END}{after}")
+    text = PAGE.read_text()
+    for mark, made in (("scenarios", table(results)), ("aims", aims(results))):
+        before, rest = text.split(f"<!-- {mark} -->")
+        after = rest.split(f"<!-- end of {mark} -->")[1]
+        text = f"{before}<!-- {mark} -->\n{made}\n<!-- end of {mark} -->{after}"
+    PAGE.write_text(text)
 
 
 def main() -> None:
@@ -425,7 +472,8 @@ def main() -> None:
     parser.add_argument("--spy", default="", help="a flame graph of the gateway (py-spy)")
     arguments = parser.parse_args()
     if arguments.table is not None:
-        print(table(json.loads(arguments.table.read_text())))
+        kept = json.loads(arguments.table.read_text())
+        print(f"{table(kept)}\n\n{aims(kept)}")
         return
     if arguments.docs:
         into_page(json.loads(RESULTS.read_text()))
@@ -455,7 +503,7 @@ def main() -> None:
                 )
                 print(json.dumps(one), file=sys.stderr, flush=True)
                 results["scenarios"].append(one)
-    print(table(results))
+    print(f"{table(results)}\n\n{aims(results)}")
     if arguments.json is not None:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(results, indent=1) + "\n")

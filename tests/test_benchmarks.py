@@ -191,7 +191,9 @@ def test_the_scenarios_check_every_value(tmp_path: Path) -> None:
 
 
 def test_the_page_has_the_kept_scenarios() -> None:
-    assert scenarios.table(json.loads(scenarios.RESULTS.read_text())) in scenarios.PAGE.read_text()
+    kept, page = json.loads(scenarios.RESULTS.read_text()), scenarios.PAGE.read_text()
+    assert scenarios.table(kept) in page
+    assert scenarios.aims(kept) in page
 
 
 def test_the_consumer_finds_what_is_wrong() -> None:

@@ -357,7 +357,8 @@ class Northbound:
         documents = dict(self._plant.status())
         documents["status"] = {**documents["status"], **self._admission.claiming.status()}
         links = {"to": self._links.kinds(), "connect": endpoints(self._config, "connect")}
-        zenoh_document = {**self.counters(), **links}
+        most = {"superseded_most": self._publisher.most_superseded()}
+        zenoh_document = {**self.counters(), **most, **links}
         own = {"zenoh": zenoh_document, "outcomes": self._incoming.outcomes()}
         origins = {
             device.name: word

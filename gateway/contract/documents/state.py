@@ -141,6 +141,7 @@ class ZenohDocument(TypedDict):
 
     published: int
     superseded: int
+    superseded_most: dict[str, int]
     congested: int
     dropped: int
     queries: int

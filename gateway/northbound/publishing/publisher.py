@@ -34,6 +34,7 @@ from gateway.tags.scan import Samples
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
+MOST_SHOWN = 10  # keys
 EVENTS_LIMIT = 10_000  # waiting puts that no newer one may replace
 
 # The JSON of a value or document is bytes, a bool declares or undeclares the liveliness token, a
@@ -107,6 +108,10 @@ class Publisher:
             "dropped": self._dropped,
             "congested": self._losses.congested,
         }
+
+    def most_superseded(self) -> dict[str, int]:
+        """Returns the keys of the values that newer ones replaced most often, with how often."""
+        return dict(self.superseded.most_common(MOST_SHOWN))
 
     @property
     def session(self) -> zenoh.Session | None:
