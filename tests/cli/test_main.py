@@ -163,9 +163,11 @@ def test_the_version_is_an_option_and_a_command(command: Command) -> None:
 @pytest.mark.parametrize(
     "arguments", [["read"], ["write", "mixer/trim", "1"], ["watch"], ["status"], ["health"]]
 )
-def test_without_a_gateway_commands_end_with_1(config: Path, arguments: list[str]) -> None:
+def test_without_a_gateway_commands_end_with_1(
+    command: Command, config: Path, arguments: list[str]
+) -> None:
     name, *more = arguments
-    done = plc_gateway(name, config, *more)
+    done = command(name, config, *more)
     assert (done.code, done.out) == (1, "")
     assert "no gateway at tcp/127.0.0.1:" in done.err
     assert "start it with `plc-gateway run`, or use --direct" in done.err
