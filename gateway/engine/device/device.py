@@ -61,7 +61,6 @@ class Device:
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
     use: float = -math.inf
-    _port_note: str = ""  # why it may not answer: the port has other settings than the file
     plan_now: InitVar[bool] = True  # False: the owner calls `plan` before the line runs
 
     def __post_init__(self, plan_now: bool) -> None:
@@ -156,8 +155,8 @@ class Device:
         heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
         if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
             return SWAPPED
-        if self._port_note and not self.health.online:
-            return self._port_note
+        if self.record.recent.port_note and not self.health.online:
+            return self.record.recent.port_note
         return diagnosis(trouble, driver.traits.no_reply_causes)
 
     def takes_one_at_a_time(self, only: bool) -> None:
@@ -180,7 +179,6 @@ class Device:
         self.health, self.record, self.use = old.health, old.record, old.use
         self.health.resyncs_elsewhere()
         self.good_reads.take_over(old.good_reads)
-        self._port_note = old._port_note
         self.one_at_a_time = old.one_at_a_time
         if self.settings.identity == old.settings.identity:
             self.identity = old.identity
@@ -192,7 +190,7 @@ class Device:
 
     def restart(self, trouble: LineDown | None = None, note: str = "") -> None:
         """Starts again after the line was opened or lost. `note`: what is wrong with the port."""
-        self._port_note = note
+        self.record.recent.opened(note)
         self.health.restart(trouble)
         self.monitor.forget()
 

@@ -144,11 +144,16 @@ class LineRecord:
 
 @dataclass(slots=True)
 class Recent:
-    """The ends of the last requests of a device, and its last good read."""
+    """The ends of the last requests of a device, its last good read, and its port."""
 
     ends: deque[str] = field(default_factory=lambda: deque(maxlen=LATELY))  # evidence, or ""
     errors: dict[str, DeviceError] = field(default_factory=dict)  # the last one by evidence
     good: float | None = None  # the last good read that a poll forgot, by the line's clock
+    port_note: str = ""  # why it may not answer: the port has other settings than the file
+
+    def opened(self, note: str) -> None:
+        """Notes what is wrong with the port that was opened; empty: nothing."""
+        self.port_note = note
 
     def fail(self, kind: str, error: DeviceError) -> None:
         self.ends.append(kind)
