@@ -65,6 +65,7 @@ TINY = [
         "--samples 2000 --rounds 1 --queries 2 --missed 200",
         [r"^catch_up of 200 samples", r"^get plant/\*\* beside three readers: p50 [\d.]+ ms"],
     ),
+    ("idle_remote", "--seconds 0.5 --pairs 1", [r"^ratio: [\d.]+ \("]),
     (
         "many_lines",
         "--seconds 6 --lines 2",
