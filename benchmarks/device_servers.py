@@ -1,11 +1,13 @@
 """Device servers that connect to one port: what 500 of them cost, and how soon they are back.
 
-    python -m benchmarks.device_servers [--count 500] [--seconds 30]
+    python -m benchmarks.device_servers [--count 500] [--seconds 30] [--delay 2] [--nat]
 
 The gateway is a process of its own. Each device server of this process registers, sends heartbeats
 and answers one Modbus RTU read a second. Then all connections are reset at once, and each connects
 again within a second. It prints processor time and memory of the gateway, and the seconds until
-every device was read again.
+every device was polled again. `--delay`: seconds on the way to a device server and back. `--nat`:
+at the end a NAT forgets all connections. Each device server connects again, the first connections
+stay open, and a stranger connects, too.
 """
 
 import argparse
@@ -14,6 +16,7 @@ import os
 import random
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ from tests.zenoh_peer import free_endpoint
 
 HEARTBEAT = 10.0  # seconds
 READ = 8  # bytes of a request
+TO_A_POLL = 3  # replies on a connection: to two requests of a resync, and to a poll
 REPLY = bytes([1, 3, 2, 0, 7])
 REPLY += crc16(REPLY)
 
@@ -31,7 +35,9 @@ REPLY += crc16(REPLY)
 class DeviceServer:
     """One of them, with a slave behind it."""
 
-    def __init__(self, number: int, port: int) -> None:
+    def __init__(self, number: int, port: int, delay: float) -> None:
+        self._delay, self._replies = delay, 0
+        self._forgotten: list[asyncio.StreamWriter] = []  # nothing of them arrives any more
         self._registration = f"DTU-{number:04}".encode()
         self._port = port
         self._writer: asyncio.StreamWriter | None = None
@@ -44,17 +50,24 @@ class DeviceServer:
             await asyncio.sleep(random.random())
 
     async def _connect(self) -> None:
-        reader, self._writer = await asyncio.open_connection("127.0.0.1", self._port)
-        self._writer.write(self._registration)
-        beats = asyncio.create_task(self._beat(self._writer))
+        reader, writer = await asyncio.open_connection("127.0.0.1", self._port)
+        self._writer, self._replies = writer, 0
+        writer.write(self._registration)
+        beats = asyncio.create_task(self._beat(writer))
         try:
             while True:
                 await reader.readexactly(READ)
-                self._writer.write(REPLY)
-                self.answered.set()
+                await asyncio.sleep(self._delay)
+                if writer.is_closing():
+                    return
+                writer.write(REPLY)
+                self._replies += 1
+                if self._replies >= TO_A_POLL:
+                    self.answered.set()
         finally:
             beats.cancel()
-            self._writer.transport.abort()
+            if writer not in self._forgotten:
+                writer.transport.abort()
 
     @staticmethod
     async def _beat(writer: asyncio.StreamWriter) -> None:
@@ -67,11 +80,19 @@ class DeviceServer:
         if self._writer is not None:
             self._writer.transport.abort()
 
+    def forget(self) -> None:
+        """Has a NAT forget the connection: it stays open, and nothing is sent on it."""
+        self.answered.clear()
+        if self._writer is not None:
+            self._forgotten.append(self._writer)
 
-def plant(folder: Path, port: int, count: int) -> Path:
+
+def plant(folder: Path, port: int, count: int, delay: float) -> Path:
     def line(number: int) -> dict[str, Any]:
         tags = {"level": {"address": "holding:7", "every": "1s"}}
-        device = {"protocol": "modbus-rtu", "station": 1, "tags": tags}
+        device: dict[str, Any] = {"protocol": "modbus-rtu", "station": 1, "tags": tags}
+        if delay:
+            device["reply_timeout"] = f"{2 * delay + 1:g}s"
         return {
             "port": f"listen://127.0.0.1:{port}",
             "device_server": {"registration": f"DTU-{number:04}", "heartbeat": "ping"},
@@ -90,12 +111,33 @@ def used(gateway: Program) -> tuple[float, float]:
     return seconds, pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
-async def measured(gateway: Program, port: int, count: int, seconds: float) -> None:
-    servers = [DeviceServer(number, port) for number in range(count)]
+async def forgotten(
+    servers: Sequence[DeviceServer], tasks: Sequence[asyncio.Task[None]], port: int
+) -> list[asyncio.Task[None]]:
+    """Has a NAT forget all connections, and waits until every device was polled again."""
+    begun = time.monotonic()
+    for one in servers:
+        one.forget()
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    again = [asyncio.create_task(one.run()) for one in servers]
+    _, stranger = await asyncio.open_connection("127.0.0.1", port)
+    stranger.write(b"DTU-9999")
+    await asyncio.gather(*(one.answered.wait() for one in servers))
+    took = time.monotonic() - begun
+    print(f"all connections forgotten: every device polled again within {took:.1f} s")
+    return again
+
+
+async def measured(
+    gateway: Program, port: int, count: int, seconds: float, delay: float, *, nat: bool
+) -> None:
+    servers = [DeviceServer(number, port, delay) for number in range(count)]
     tasks = [asyncio.create_task(one.run()) for one in servers]
     begun = time.monotonic()
     await asyncio.gather(*(one.answered.wait() for one in servers))
-    print(f"{count} device servers read {time.monotonic() - begun:.1f} s after they began")
+    print(f"{count} device servers polled {time.monotonic() - begun:.1f} s after they began")
     before, began = used(gateway)[0], time.monotonic()
     await asyncio.sleep(seconds)
     after, memory = used(gateway)
@@ -105,7 +147,11 @@ async def measured(gateway: Program, port: int, count: int, seconds: float) -> N
     for one in servers:
         one.reset()
     await asyncio.gather(*(one.answered.wait() for one in servers))
-    print(f"all connections reset: every device read again within {time.monotonic() - begun:.1f} s")
+    print(
+        f"all connections reset: every device polled again within {time.monotonic() - begun:.1f} s"
+    )
+    if nat:
+        tasks = await forgotten(servers, tasks, port)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
@@ -115,11 +161,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--delay", type=float, default=0.0)
+    parser.add_argument("--nat", action="store_true")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         port = free_port()
-        with started(plant(Path(folder), port, asked.count)) as gateway:
-            asyncio.run(measured(gateway, port, asked.count, asked.seconds))
+        with started(plant(Path(folder), port, asked.count, asked.delay)) as gateway:
+            asyncio.run(
+                measured(gateway, port, asked.count, asked.seconds, asked.delay, nat=asked.nat)
+            )
             gateway.lines.clear()  # it prints them at the end
 
 

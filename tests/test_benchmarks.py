@@ -119,7 +119,7 @@ TINY = [
     (
         "device_servers",
         "--count 3 --seconds 0.1",
-        [r"^3 device servers read", r"within [0-9.]+ s$"],
+        [r"^3 device servers polled", r"within [0-9.]+ s$"],
     ),
     ("served", "--seconds 0.5", [r"^served-1: \d+ replies, \d+ lost: median", r"^a written value"]),
     ("sim_speed", "--minutes 0.05", [r"^every +30 s: +[\d.]+ simulated hours per minute"]),

@@ -1,10 +1,16 @@
 """RS-485 direction by the kernel: the structure of linux/serial.h, and drivers that cannot."""
 
 import fcntl
+import os
+import shutil
 import struct
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
+import serialx
 
 from gateway.errors import LineDown
 from gateway.transport import SerialPath, SerialSettings, open_port
@@ -81,3 +87,47 @@ async def test_a_driver_without_rs485_says_what_to_do() -> None:
             await open_port(SerialPath(plug.path), settings, RecordingReceiver())
     finally:
         plug.unplug()
+
+
+PATCH = Path(__file__).parent / "upstream" / "serialx-rs485.patch"
+UPSTREAM = """
+import asyncio, fcntl, os, struct, sys
+import serialx
+from serialx.common import Rs485Settings, UnsupportedSetting
+
+kept, ioctl = bytes(32), fcntl.ioctl
+can = int(sys.argv[1])  # the flags that the driver can
+
+def switched(port, request, data=b"", *more):
+    global kept
+    if request == 0x542F:
+        flags, *rest = struct.unpack("=8I", data)
+        kept = struct.pack("=8I", flags & can, *rest)
+    return kept if request in (0x542E, 0x542F) else ioctl(port, request, data, *more)
+
+async def main():
+    master, slave = os.openpty()
+    rs485 = Rs485Settings(delay_before_rx=0.029, loopback=True)
+    made = serialx.create_serial_connection(
+        asyncio.get_running_loop(), asyncio.Protocol, os.ttyname(slave), 19200, rs485=rs485)
+    try:
+        transport, _ = await made
+        transport.close()
+    except UnsupportedSetting:
+        print("refused")
+    print(*struct.unpack("=8I", kept)[:3])
+
+fcntl.ioctl = switched
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize(("can", "said"), [(0xFF, "19 0 29"), (1, "refused 1 0 29")])
+def test_the_patch_for_serialx_does_the_same(tmp_path: Path, can: int, said: str) -> None:
+    package = Path(serialx.__file__).parent
+    shutil.copytree(package, tmp_path / "serialx", ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run(["git", "apply", PATCH], cwd=tmp_path, check=True)
+    patched = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", UPSTREAM, str(can)]
+    done = subprocess.run(command, env=patched, cwd=tmp_path, capture_output=True, text=True)  # noqa: PLW1510
+    assert done.stdout.split() == said.split(), done.stderr
