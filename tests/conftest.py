@@ -3,17 +3,31 @@
 import os
 import shutil
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
+import structlog
 from hypothesis import settings
 
 from tests.sim.virtual import run_virtual as run_virtual_coroutine
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+
+@pytest.fixture(autouse=True)
+def _logs(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Takes back what a command that ran in this process set up, and lets no logger keep it."""
+    before, configure = structlog.get_config(), structlog.configure
+
+    def uncached(**changed: Any) -> None:
+        configure(**changed | {"cache_logger_on_first_use": False})
+
+    monkeypatch.setattr(structlog, "configure", uncached)
+    yield
+    configure(**before)
 
 
 @pytest.fixture

@@ -29,6 +29,12 @@ DRIVER = "pip install --no-deps --no-build-isolation examples/driver"
 OFFLINE = (
     "pip install --no-index --find-links wheels --require-hashes --requirement requirements.txt"
 )
+# The same with the folder of a version.
+UPGRADE = (
+    OFFLINE.replace("install ", "install --quiet ")
+    .replace(" wheels", " zenoh-plc-gateway-1.1.0-offline/wheels")
+    .replace(" requirements.txt", " zenoh-plc-gateway-1.1.0-offline/requirements.txt")
+)
 IMAGE = "docker build -t plc-gateway ."
 BRIDGES_IMAGE = "docker build --build-arg PINS=constraints-bridges.txt -t plc-gateway:bridges ."
 PINNED_IMAGE = "docker build --build-arg BASE=python:3.12-slim@sha256:"
@@ -61,7 +67,7 @@ def packages() -> set[str]:
 
 def test_every_sentence_that_installs_is_one_of_those_below() -> None:
     others = {command for command in COMMANDS if " -" in command}
-    assert others == {PINNED, CLONE, DRIVER, OFFLINE, IMAGE, BRIDGES_IMAGE, PINNED_IMAGE}
+    assert others == {PINNED, CLONE, DRIVER, OFFLINE, UPGRADE, IMAGE, BRIDGES_IMAGE, PINNED_IMAGE}
     assert {command for command in COMMANDS if not command.startswith(("pip ", "docker "))} == set()
 
 

@@ -48,6 +48,7 @@ PAGES = {
 TESTS = {
     r"\.venv/bin/plc-gateway (watch|read) config": "tests/e2e/test_newcomer.py",
     r"\.venv/bin/plc-gateway write config": "tests/test_docs.py",
+    r"plc-gateway archive (run|status) ": "tests/archive/test_archive.py",
     r"plc-gateway bench ": "tests/cli/test_bench.py",
     r"plc-gateway bridge mqtt .*--sparkplug": "tests/bridges/test_sparkplug.py",
     r"plc-gateway bridge mqtt|mosquitto_(sub|pub) ": "tests/bridges/test_mqtt.py",
@@ -76,6 +77,7 @@ NOT_RUN = {
     r"(cc|\./read_and_write) ": "zenoh-pico is not at hand; docs/languages.md tells",
     r"make ": "it runs this suite, or for minutes to hours",
     r".*\bpip install": "it needs the network; tests/test_installs.py tries what it can",
+    r"sudo -u postgres ": "it changes the machine; tests/archive has a server of its own",
     r"docker ": "it needs Docker; tests/test_packaging.py reads the Dockerfile",
     r"systemctl |systemd-sysusers |runuser .* check|kill -HUP \$\(pidof": (
         "it changes the services of the machine; tests/test_packaging.py reads the units"

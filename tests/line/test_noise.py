@@ -71,7 +71,7 @@ async def test_a_noisy_wire_gives_more_than_half_of_what_it_could_carry(
 ) -> None:
     """Of each four damaged replies one is lost, and the others have one wrong bit anywhere."""
     _, _, share, _, wrong = await measure(protocol, 0.25, healthy, 60.0)
-    assert (float(share) >= 0.6, wrong) == (True, "0")
+    assert (float(share) >= 0.5, wrong) == (True, "0")
 
 
 @on_virtual_time

@@ -23,6 +23,7 @@ from tests.northbound.plant import PlainPlant, mixer
 TOKEN = "0123456789-0123456789"  # noqa: S105  (of these tests only)
 ZENOH = {
     **dict.fromkeys(ZenohDocument.__annotations__, 0),
+    "superseded_most": {},
     "to": ["client"],
     "connect": [],
     "published": 7,
