@@ -67,6 +67,7 @@ class _Node:
 
     span: Span
     good: bool | None = None
+    is_damaged: bool = False  # replies arrived in part: noise, not a missing address
     halves: tuple["_Node", ...] = ()
 
     def settled(self) -> bool:
@@ -82,7 +83,8 @@ class _Node:
 
     def failed_twice(self) -> set[Cut]:
         """Returns the boundaries between the halves of failed blocks, where a half failed too."""
-        if not any(half.halves or half.good is False for half in self.halves):
+        failed = (half for half in self.halves if half.halves or half.good is False)
+        if self.is_damaged or not any(not half.is_damaged for half in failed):
             return set()
         inside = (half.failed_twice() for half in self.halves)
         return {(self.span.area, self.halves[1].span.start)}.union(*inside)
@@ -154,6 +156,7 @@ class BadAddresses:
         if node is None:
             node = _Node(block.span)
             self.searches.append(node)
+        node.is_damaged = code == DAMAGED
         halves = self._halves(block, node)
         if not halves:
             node.good = False

@@ -91,7 +91,7 @@ class HarmlessReads:
             turn, place = divmod(turn, len(others))
             first = others[place]
         reads = first[turn % 2]
-        return reads[(2 * turn + second) % len(reads)]
+        return reads[(2 * step + second) % len(reads)]
 
     def proof(self, used: tuple[Hashable, ...] = ()) -> Span | None:
         """Returns a read whose form no other resync has, nor those `used`; None: there is none."""
