@@ -5,10 +5,8 @@ crash changes nothing, and the cursor may follow in a second request.
 """
 
 import http.client
-import os
 import time
 import urllib.error
-import urllib.request
 from collections.abc import Mapping, Sequence
 from urllib.parse import parse_qs, urlencode, urlsplit
 
@@ -17,6 +15,7 @@ import orjson
 from gateway.archive.rows import Row
 from gateway.archive.store import Cursor, Gap, StoreDown, cursor_of
 from gateway.bridges.influx.lines import escaped, line_of, quoted
+from gateway.bridges.influx.server import request
 from gateway.errors import ConfigError
 
 _BATCH = 5000  # lines of a request
@@ -84,14 +83,8 @@ class InfluxStore:
 
     def _request(self, url: str, body: bytes | None = None) -> bytes:
         """Raises `StoreDown`, and `HTTPError` for an answer."""
-        headers = {"Content-Type": "text/plain; charset=utf-8"}
-        if token := os.environ.get("INFLUX_TOKEN"):
-            headers["Authorization"] = f"Token {token}"
-        request = urllib.request.Request(url, body, headers)  # noqa: S310  (the command line names it)
         try:
-            with urllib.request.urlopen(request, timeout=_ANSWER_WITHIN) as answer:  # noqa: S310
-                found: bytes = answer.read(2**24)
-                return found
+            return request(url, body, _ANSWER_WITHIN)
         except urllib.error.HTTPError:
             raise
         except (OSError, http.client.HTTPException) as error:

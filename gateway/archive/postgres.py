@@ -4,7 +4,7 @@ Rows arrive by COPY, in one transaction with the cursor of the gateway.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from urllib.parse import urlsplit
 
 import psycopg
@@ -119,7 +119,8 @@ class PostgresStore:
             tcp_user_timeout=30_000,
             application_name="plc-gateway archive",
         )
-        try:
+        with ExitStack() as unless_ready:
+            unless_ready.callback(connection.close)
             with connection.transaction():
                 connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
                 # A user who may only insert cannot create, not even what exists.
@@ -129,9 +130,7 @@ class PostgresStore:
                     timescale = "SELECT 1 FROM pg_extension WHERE extname = 'timescaledb'"
                     is_there = connection.execute(timescale).fetchone() is not None
                     connection.execute(_HYPERTABLE if is_there else _BY_TIME)
-        except BaseException:
-            connection.close()
-            raise
+            unless_ready.pop_all()
         return connection
 
 

@@ -38,7 +38,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Cursor:
-    """How far a gateway is archived. Times are microseconds since 1970."""
+    """The progress of one gateway. Times are microseconds since 1970."""
 
     gateway: str  # its key: plant/@gateway/demo
     after: str = ""  # the place of the last sample, as the gateway has named it

@@ -94,7 +94,7 @@ class Turn:
 
     def _declare(self, wanted: Collection[Role]) -> None:
         for role in self._declared.keys() - set(wanted):
-            self._declared.pop(role).undeclare()  # type: ignore[no-untyped-call]  # as in `Incoming`
+            self._declared.pop(role).undeclare()  # type: ignore[no-untyped-call]  # the stub lacks it
         for role in wanted:
             if role not in self._declared:
                 key = self._group.key(RoleToken(role, self._name, self._election.session))

@@ -94,7 +94,7 @@ def check_device_servers(lines: Mapping[str, PortAddress], mistakes: Mistakes) -
 def check_heartbeat(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> None:
-    """What a device server sends by itself is dropped: no reply may begin with it."""
+    """Refuses a word of a device server with which replies begin: the word is dropped."""
     own = line.device_server
     for name in ("registration", "heartbeat") if own is not None else ():
         word: bytes = getattr(own, name) or b""

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from gateway.engine.device.device import ECHO_PROVEN_FOR, SECONDS
+from gateway.engine.device.device import ECHO_PROVEN_FOR
 from gateway.engine.device.health import FORGOTTEN
 from gateway.engine.device.identity import SILENT_FOR
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
@@ -15,6 +15,7 @@ from gateway.engine.jobs.unanswered import SEEN_FOR
 from gateway.engine.results.bit_writes import LACKED_FOR
 from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
 from gateway.engine.results.pipelining import TRY_AGAIN
+from gateway.engine.results.second_requests import MOST_SILENT
 from gateway.planning.bad_addresses import RETRIES, SPLIT_LONGEST
 
 AT_ONCE = 0.0
@@ -167,7 +168,7 @@ BELIEFS = (
     ),
     Belief(
         "the device is silent about second requests of resyncs",
-        f"{SECONDS} of them without a reply, and no late reply for a minute",
+        f"{MOST_SILENT} of them without a reply, and no late reply for a minute",
         "ten minutes",
         "their replies have a form that was not requested for long",
         WARY_FOR,

@@ -1,7 +1,12 @@
 """The second request of a resync: its reply has the form that was requested longest ago."""
 
-from gateway.engine.device.device import SECONDS
 from gateway.engine.device.device import Device as EngineDevice
+from gateway.engine.results.second_requests import (
+    MOST_SILENT,
+    is_like_a_second,
+    leave_second,
+    second_token,
+)
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from tests.sim.bench import WIRE
@@ -27,7 +32,7 @@ def test_it_has_the_form_that_was_requested_longest_ago() -> None:
     for now in range(8):
         token = plc.health.next_probe_token()
         plc.shapes.probed(None, token, plc.probe_spans, now)
-        forms.append(form(plc, None, plc.second_token(None, token + 1, now)))
+        forms.append(form(plc, None, second_token(plc, None, token + 1, now)))
         assert forms[-1] != form(plc, None, token)
     assert len(set(forms)) == 2  # two registers and four: first requests read one and three
 
@@ -37,39 +42,39 @@ def test_it_has_not_the_form_of_what_a_program_reads() -> None:
     assert plc.shapes is not None
     for size in (1, 2, 3):
         plc.shapes.also_sent(plc.shapes.of(Span("holding", 700, size)), 5.0)
-    token = plc.second_token(None, plc.health.next_probe_token() + 1, 6.0)
+    token = second_token(plc, None, plc.health.next_probe_token() + 1, 6.0)
     assert form(plc, None, token) == plc.shapes.of(Span("holding", 700, 4))
 
 
 def test_a_device_with_single_registers_gets_the_first_choice() -> None:
     plc, one = made(*SINGLE), Span("holding", 100, 1)
-    assert [plc.second_token(one, token, 1.0) for token in (3, 5, 7)] == [3, 5, 7]
+    assert [second_token(plc, one, token, 1.0) for token in (3, 5, 7)] == [3, 5, 7]
 
 
 def test_a_device_that_is_silent_about_it_gets_the_first_choice() -> None:
     plc = made(*SEVERAL)
     plc.note_resync(None, 3, 0.5)
-    chosen = plc.second_token(None, 3, 1.0)
+    chosen = second_token(plc, None, 3, 1.0)
     assert chosen != 3
-    for _ in range(SECONDS):
-        plc.leave_second(None, chosen, 1.0)
-    assert plc.second_token(None, 3, 2.0) == 3
+    for _ in range(MOST_SILENT):
+        leave_second(plc, None, chosen, 1.0)
+    assert second_token(plc, None, 3, 2.0) == 3
 
 
 def test_a_device_that_is_late_is_not_taken_for_a_silent_one() -> None:
     plc = made(*SEVERAL)
     plc.health.probes.replied_late(0.9)
     for _ in range(9):
-        plc.leave_second(None, 5, 1.0)
+        leave_second(plc, None, 5, 1.0)
     plc.note_resync(None, 3, 0.5)
-    assert plc.second_token(None, 3, 2.0) != 3
+    assert second_token(plc, None, 3, 2.0) != 3
 
 
 def test_a_later_resync_of_its_form_proves_nothing_until_one_is_answered() -> None:
     plc = made(*ROW)
-    plc.leave_second(None, 7, 1.0)
-    alike = [token for token in range(8, 40, 2) if plc.is_like_a_second(None, token)]
+    leave_second(plc, None, 7, 1.0)
+    alike = [token for token in range(8, 40, 2) if is_like_a_second(plc, None, token)]
     assert alike
-    assert any(not plc.is_like_a_second(None, token) for token in range(8, 40, 2))
+    assert any(not is_like_a_second(plc, None, token) for token in range(8, 40, 2))
     plc.health.answered(resynced=True)
-    assert not any(plc.is_like_a_second(None, token) for token in alike)
+    assert not any(is_like_a_second(plc, None, token) for token in alike)

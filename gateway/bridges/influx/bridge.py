@@ -13,11 +13,9 @@ lines, after a time without the gateway, and with a state file after a restart o
 
 import asyncio
 import http.client
-import os
 import sys
 import time
 import urllib.error
-import urllib.request
 from collections import deque
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +23,7 @@ from typing import NamedTuple
 from gateway.bridges.documents import Known, utc_now
 from gateway.bridges.influx.gaps import Gaps
 from gateway.bridges.influx.lines import line_of
+from gateway.bridges.influx.server import request
 from gateway.bridges.program import Gateways, opened, say
 from gateway.bridges.remote_plant import RemotePlant
 from gateway.errors import GatewayError
@@ -128,12 +127,7 @@ class Bridge:
             sys.stdout.buffer.write(body)
             sys.stdout.buffer.flush()
             return
-        token = os.environ.get("INFLUX_TOKEN")
-        headers = {"Content-Type": "text/plain; charset=utf-8"}
-        headers |= {"Authorization": f"Token {token}"} if token else {}
-        request = urllib.request.Request(self._to, body, headers)  # noqa: S310  (the command line names it)
-        with urllib.request.urlopen(request, timeout=ANSWER_WITHIN):  # noqa: S310  (as above)
-            pass
+        request(self._to, body, ANSWER_WITHIN)
 
     async def recover(self) -> None:
         """Fills gaps from the history, while the server takes lines."""

@@ -32,7 +32,7 @@ _PEM = "application/x-pem-file"
 
 
 class Enrolment(BaseModel):
-    """What a newcomer sends."""
+    """The request of a newcomer."""
 
     name: str = Field(max_length=64)
     secret: str = Field(max_length=64)
@@ -40,7 +40,7 @@ class Enrolment(BaseModel):
 
 
 class Renewal(BaseModel):
-    """What a gateway sends before its certificate ends."""
+    """The request of a gateway whose certificate ends soon."""
 
     certificate: str = Field(max_length=16_384)
     request: str = Field(max_length=8192)
@@ -67,7 +67,7 @@ class Desk:
             try:
                 await off_loop(sweep, self._authority.folder, within=WITHIN)
             except GatewayError as error:
-                log.error("codes not swept", why=str(error))  # noqa: TRY400
+                log.error("codes not swept", why=str(error))  # noqa: TRY400  (our own error)
 
     async def _certificate(self, _: web.Request) -> web.Response:
         return web.Response(body=self._authority.certificate, content_type=_PEM)
@@ -111,7 +111,7 @@ class Desk:
         except ConfigError as error:
             status, why = 400, str(error)
         except GatewayError as error:
-            log.error("not signed", why=str(error))  # noqa: TRY400
+            log.error("not signed", why=str(error))  # noqa: TRY400  (our own error)
             return answer(503, "the authority cannot sign now: see its log")
         else:
             self._tries.pop(client, None)

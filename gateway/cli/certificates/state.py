@@ -43,7 +43,7 @@ class Entry(BaseModel):
 
 
 class State(BaseModel):
-    """What the authority remembers. `at`: host and port where it is reached. `revoked`: serial
+    """The memory of an authority. `at`: host and port where it is reached. `revoked`: serial
     numbers with the time, s since 1970."""
 
     at: str = ""

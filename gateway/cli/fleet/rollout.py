@@ -39,7 +39,7 @@ _STOPS = (Result.REFUSED, Result.WORSE, Result.LOST)
 
 
 class Ended(NamedTuple):
-    """What became of one gateway: prefix and name, the result, and a sentence or nothing."""
+    """The end of one gateway: prefix and name, the result, and a sentence or nothing."""
 
     gateway: str
     result: Result

@@ -27,8 +27,6 @@ MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of 
 PLANNING = 2e-4  # seconds for each tag and interval, estimated
 SILENT_SHARE = 0.01  # share of the time for new tries of silent addresses
 MOST_PROBED = 8  # places among which the resyncs change
-SECONDS = 2  # second requests without a reply, until only the first choice is sent
-MOST_SECONDS = 32  # tokens that the second request of a resync may have
 WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
 ANSWERS_TWICE = (
     "Answers twice: a second master is on the line, two stations have the number {station}, or a "
@@ -380,47 +378,11 @@ class Device:
         own = shapes.of_resync(self.health.outstanding, PROOF, self.probe_spans)
         return own is not None and own not in {shapes.of(span) for span in asked if span}
 
-    def second_token(self, outstanding: Span | None, token: int, now: float) -> int:
-        """Returns the token of the second request of a resync: of the next ones that whose read has
-        the form that was requested longest ago. A station later than `late_guard` may still reply
-        to the others. `token`: the first choice, also where no read inside the spans has another
-        form, or the device is silent about it.
-        """
-        shapes, spans = self.shapes, self.probe_spans
-        if shapes is None or now < shapes.proofs.seconds_from:
-            return token
-        inside = shapes.inside(spans, outstanding)
-        found, longest_ago = token, math.inf
-        for one in (PROOF, *range(token, token + MOST_SECONDS)):
-            shape = shapes.of_resync(outstanding, one, spans)
-            if shape in inside and (at := shapes.used_at(shape)) < longest_ago:
-                found, longest_ago = one, at
-        self.note_resync(outstanding, found, now)
-        return found
-
     def note_resync(self, outstanding: Span | None, token: int, now: float) -> None:
         """Notes a resync that belongs to another request, or follows another resync."""
         if self.shapes is not None:
             shape = self.shapes.of_resync(outstanding, token, self.probe_spans)
             self.shapes.also_sent(shape, now)
-
-    def leave_second(self, outstanding: Span | None, token: int, now: float) -> None:
-        """Notes that the second request of a resync has no reply: its token is none of the row."""
-        shapes, seconds = self.shapes, self.health.unanswered.seconds
-        if shapes is not None:
-            seconds.append(shapes.of_resync(outstanding, token, self.probe_spans))
-            if len(seconds) >= SECONDS and not self.health.probes.was_late(now):
-                shapes.proofs.lacks_seconds(now)
-
-    def is_like_a_second(self, outstanding: Span | None, token: int) -> bool:
-        """Returns True if the reply to a resync may be that to an earlier second request."""
-        seconds, shapes, spans = self.health.unanswered.seconds, self.shapes, self.probe_spans
-        if not seconds or shapes is None or token == PROOF:
-            return False
-        # A second read follows a refused one.
-        return any(
-            shapes.of_resync(outstanding, one, spans) in seconds for one in (token, token + 1)
-        )
 
     # Its share of the wire
 

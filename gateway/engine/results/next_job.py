@@ -29,6 +29,7 @@ from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.proofs import Proofs
 from gateway.engine.results.request_rules import RequestRules
+from gateway.engine.results.second_requests import is_like_a_second, leave_second, second_token
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.errors import (
     BadValue,
@@ -227,7 +228,7 @@ class NextJob:
                 device.health.inherit(inherits=False)
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
-                token = device.second_token(after.outstanding, after.token + 1, now)
+                token = second_token(device, after.outstanding, after.token + 1, now)
                 again = Probe(device, after.outstanding, token, again=True)
                 self._in_flight.follow(again)
             return
@@ -261,7 +262,9 @@ class NextJob:
 
 def _told_from(probe: Probe, result: Resynced | Refused) -> int:
     """Returns the number of unanswered requests from which the reply is told."""
-    if isinstance(result, Refused) or probe.device.is_like_a_second(probe.outstanding, probe.token):
+    if isinstance(result, Refused) or is_like_a_second(
+        probe.device, probe.outstanding, probe.token
+    ):
         return 0
     return result.told_from
 
@@ -269,7 +272,7 @@ def _told_from(probe: Probe, result: Resynced | Refused) -> int:
 def _leave_second(probe: Probe, now: float) -> None:
     """Notes that the second request of a resync has no reply."""
     if probe.again and probe.token != PROOF:
-        probe.device.leave_second(probe.outstanding, probe.token, now)
+        leave_second(probe.device, probe.outstanding, probe.token, now)
 
 
 def _is_suspect(poll: Poll) -> bool:
