@@ -25,6 +25,7 @@ from gateway.errors import GatewayError
 PAGE = 10_000  # samples
 PAGES = 8  # under way at once
 RETRY, LONGEST_PAUSE = 1.0, 30.0  # seconds
+MOST_GATEWAYS = 10_000
 NOTE_EVERY = 60.0  # seconds: a gateway without new samples is noted as whole
 T = TypeVar("T")
 
@@ -140,10 +141,14 @@ class Archiver:
         )
 
     def _is_there(self, gateway: str) -> None:
-        if gateway in self._followers:
-            self._followers[gateway].wake.set()
-        self._gateways.add(gateway)
-        self._arrived.set()
+        if gateway in self._gateways:
+            if gateway in self._followers:
+                self._followers[gateway].wake.set()
+        elif len(self._gateways) < MOST_GATEWAYS:
+            self._gateways.add(gateway)
+            self._arrived.set()
+        else:
+            say(f"{gateway} is not archived: there are {MOST_GATEWAYS} gateways already")
 
     async def work(self) -> None:
         """Archives until it is cancelled."""

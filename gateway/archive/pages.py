@@ -7,7 +7,7 @@ import orjson
 import zenoh
 
 from gateway.archive.rows import Row, row_of
-from gateway.bridges.documents import copied, described_by, document_of
+from gateway.bridges.documents import copied, described_by, document_of, is_name
 from gateway.bridges.requests import Requests
 from gateway.errors import GatewayError
 
@@ -78,14 +78,14 @@ class History:
         if not file_of(place):
             raise GatewayError("its history is not ready")
         samples = samples[: whole - again]
-        await self._describe({key for key, _, _, about in samples if about})
+        await self._describe({key for key, _, _, about in samples if about and is_name(key)})
         rows = [row for sample in samples if (row := self._row(*sample)) is not None]
         is_whole = is_last and not again
         return Page(rows, place, is_last, is_whole, lost, len(samples) - len(rows))
 
     def _row(self, key: str, is_put: bool, payload: bytes, about: bytes) -> Row | None:
         known = document_of(self._types.get(key, _JSON), is_put, payload, about)
-        return None if known is None else row_of(key, known)
+        return row_of(key, known) if known is not None and is_name(key) else None
 
     async def _describe(self, raw: set[str]) -> None:
         """Asks for the types of tags whose payload does not tell a text from a number."""

@@ -25,6 +25,7 @@ from gateway.errors import ConfigError
 
 _DAY = 86400 * 10**6  # microseconds
 PART = 250_000  # rows of a file
+_MOST_KNOWN = 10_000  # partitions whose last part is remembered
 _GROUP = 50_000  # rows of which a reader skips those of another time
 SCHEMA = pa.schema(
     [
@@ -152,6 +153,8 @@ class ParquetStore:
         if count:
             table = pa.concat_tables([self._table(whole), table], promote_options="default")
         self._write(whole, table)
+        if len(self._last) >= _MOST_KNOWN:
+            self._last.clear()
         self._last[folder] = path, count + len(rows)
 
     def _take_back(self, pending: Pending) -> None:

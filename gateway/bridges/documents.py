@@ -28,11 +28,17 @@ def described_by(key: str, payload: bytes) -> Known | None:
     """Returns the description of a tag, None for that of another program."""
     with suppress(ValueError):
         meta = orjson.loads(payload)
-        if isinstance(meta, dict) and isinstance(meta.get("type"), str) and "+" not in key:
+        if isinstance(meta, dict) and isinstance(meta.get("type"), str) and is_name(key):
             plain = {"unit": "", "description": "", "history": False, "write": None}
             found: Known = plain | meta
             return found
     return None
+
+
+def is_name(key: str) -> bool:
+    """Returns False for a key of another program that no broker and no database takes. Zenoh allows
+    every character but its own."""
+    return key.isprintable() and "+" not in key
 
 
 def parsed(meta: Known, is_put: bool, payload: bytes, about: bytes) -> Known:

@@ -35,7 +35,9 @@ _INSTALLED_BY = {
 
 
 def say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    """Prints one line, whatever names and reasons of other programs hold."""
+    line = "".join(one if one.isprintable() else "\ufffd" for one in text)
+    print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager

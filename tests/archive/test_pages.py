@@ -81,6 +81,18 @@ async def test_what_is_no_sample_is_counted_and_what_comes_again_is_left_out() -
     assert (page.strange, page.is_last, page.is_whole, page.file) == (1, True, False, "1f.a0")
 
 
+async def test_a_key_that_no_database_takes_is_strange() -> None:
+    """A NUL in it would stop the archive of its gateway for ever."""
+
+    def answer(query: zenoh.Query) -> None:
+        for key in ("plant/mixer/speed", "plant/mixer/a\0b", "plant/mixer/a\nb"):
+            query.reply(key, json.dumps(SAMPLE))
+        query.reply(f"{DEMO}/page", json.dumps(END | {"samples": 3}))
+
+    page = await asked(answer)
+    assert ([row.key for row in page.rows], page.strange) == (["plant/mixer/speed"], 2)
+
+
 def test_the_mark_of_a_file_is_in_a_place() -> None:
     assert [file_of(place) for place in ("", "de-mo:1f.a0-4711-12", "demo:-0-0")] == [
         "",

@@ -76,3 +76,10 @@ def test_a_document_of_another_program_is_garbled(about: dict[str, object]) -> N
 def test_bytes_of_another_program_are_garbled(payload: bytes) -> None:
     assert parsed(META, True, payload, b"")["reason"] == "garbled"
     assert described_by("a/b", payload) is None
+
+
+@pytest.mark.parametrize("key", ["a/b+", "a/b\0", "a/b\nplc,device=oven"])
+def test_a_key_that_no_broker_takes_is_no_tag(key: str) -> None:
+    meta = b'{"type": "int16"}'
+    assert described_by("a/b c", meta) is not None
+    assert described_by(key, meta) is None

@@ -226,6 +226,10 @@ async def test_a_gap_is_kept_until_it_is_filled(tmp_path: Path) -> None:
 def test_a_name_of_another_program_cannot_forge_a_field() -> None:
     line = line_of("a b/c,good=true x", document(7))
     assert line.startswith("plc,device=a\\ b,name=c\\,good\\=true\\ x value=7.0,good=true ")
+    line = line_of("a/b\nplc,device=oven", document(7) | {"origin": "held,x=1 good"})
+    assert line.startswith(
+        "plc,device=a,name=b\\ plc\\,device\\=oven,origin=held\\,x\\=1\\ good value=7.0,good=true "
+    )
 
 
 def test_lines_may_be_read_by_head() -> None:

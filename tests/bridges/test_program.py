@@ -37,3 +37,8 @@ def test_a_bridge_without_its_packages_names_them() -> None:
         raise ModuleNotFoundError("no", name="aiomqtt")
     with pytest.raises(ModuleNotFoundError), program.packages_of("bridge mqtt"):
         raise ModuleNotFoundError("no", name="gateway.bridges.none")
+
+
+def test_a_name_of_another_program_forges_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    program.say("plant/@gateway/a\nplant/@gateway/b\x1b[2J: archived")
+    assert capsys.readouterr().err == "plant/@gateway/a\ufffdplant/@gateway/b\ufffd[2J: archived\n"

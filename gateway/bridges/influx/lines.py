@@ -41,17 +41,22 @@ def line_of(key: str, known: Known) -> str:
             fields += f",text={quoted(str(known['text']))}"
     if "limited" in known:
         fields += f",limited={quoted(known['limited'])}"
-    origin = f",origin={known['origin']}" if "origin" in known else ""
+    origin = f",origin={escaped(known['origin'])}" if known.get("origin") else ""
     nanoseconds = round(datetime.fromisoformat(known["time"]).timestamp() * 1_000_000) * 1000
     return f"plc,device={escaped(device)},name={escaped(tag)}{origin} {fields} {nanoseconds}"
 
 
 def quoted(text: str) -> str:
-    """Returns a field's text; the protocol has no escape for a line's end."""
-    text = " ".join(text.splitlines()).replace("\\", "\\\\").replace('"', '\\"')
+    """Returns a field's text."""
+    text = _one_line(text).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{text}"'
 
 
 def escaped(name: str) -> str:
     """Returns a name as the value of a tag: another program may have any key."""
-    return _SEPARATORS.sub(r"\\\1", name)
+    return _SEPARATORS.sub(r"\\\1", _one_line(name))
+
+
+def _one_line(text: str) -> str:
+    """The protocol has no escape for a line's end."""
+    return " ".join(text.splitlines())
