@@ -7,14 +7,13 @@ import orjson
 import zenoh
 
 from gateway.archive.rows import Row, row_of
-from gateway.bridges.documents import copied, described_by, document_of, is_name
+from gateway.bridges.documents import copied, document_of, is_name
 from gateway.bridges.requests import Requests
 from gateway.errors import GatewayError
 
 ANSWER_WITHIN = 60.0  # seconds: a gateway works for five, the link may need longer
 # Every value goes first. An answer waits in the gateway until there is room.
 _LOW = zenoh.Priority.BACKGROUND
-_JSON = {"type": "int64"}  # the description of a tag whose payload says everything itself
 
 
 class Page(NamedTuple):
@@ -46,9 +45,6 @@ class History:
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self.key = key
         self._requests = Requests(session, key)
-        self._prefix = key.partition("/@gateway/")[0]
-        self._plant = Requests(session, self._prefix)
-        self._types: dict[str, dict[str, str]] = {}  # of tags with `payload: raw`, by key
 
     async def page(self, after: str, size: int) -> Page:
         """Raises `GatewayError` where not all of it has arrived."""
@@ -78,24 +74,15 @@ class History:
         if not file_of(place):
             raise GatewayError("its history is not ready")
         samples = samples[: whole - again]
-        await self._describe({key for key, _, _, about in samples if about and is_name(key)})
-        rows = [row for sample in samples if (row := self._row(*sample)) is not None]
+        rows = [row for key, _, data, _ in samples if (row := _row(key, data)) is not None]
         is_whole = is_last and not again
         return Page(rows, place, is_last, is_whole, lost, len(samples) - len(rows))
 
-    def _row(self, key: str, is_put: bool, payload: bytes, about: bytes) -> Row | None:
-        known = document_of(self._types.get(key, _JSON), is_put, payload, about)
-        return row_of(key, known) if known is not None and is_name(key) else None
 
-    async def _describe(self, raw: set[str]) -> None:
-        """Asks for the types of tags whose payload does not tell a text from a number."""
-        for key in raw - self._types.keys():
-            stem = key.removeprefix(f"{self._prefix}/")
-            for reply in await self._plant.ask(f"{stem}/@meta"):
-                if reply.ok and (meta := described_by(stem, reply.ok.payload.to_bytes())):
-                    self._types[key] = meta
-            if key not in self._types:
-                raise GatewayError(f"no gateway describes {stem}")
+def _row(key: str, payload: bytes) -> Row | None:
+    """Returns None for what is no sample. Every sample is JSON here, of bare values too."""
+    known = document_of({}, is_put=True, payload=payload, about=b"")
+    return row_of(key, known) if known is not None and is_name(key) else None
 
 
 def _why(error: zenoh.ReplyError) -> str:

@@ -163,6 +163,9 @@ async def test_the_page_of_a_gateway_has_its_samples_only(tmp_path: Path) -> Non
             assert end.key == "plant/@gateway/demo/page"
             assert end.json["samples"] == len(samples) > 5
             assert all(str(one.key).startswith("plant/demo-plc/") for one in samples)
+            bare = [one.json for one in samples if one.key == "plant/demo-plc/raw"]
+            assert bare
+            assert all("quality" in known for known in bare)
 
 
 @pytest.mark.parametrize("option", [("--every", "0"), ("--rate", "0"), ("--rate", "x")])

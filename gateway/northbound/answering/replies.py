@@ -204,7 +204,11 @@ class Replies:
             raise lost
 
     def _recorded(self, query: zenoh.Query, sample: Sample) -> None:
-        encoding.reply(query, self._keys.value(sample.tag.key), sample, self._stamp())
+        key, stamp = self._keys.value(sample.tag.key), self._stamp()
+        if str(query.key_expr) == self._keys.page:  # a bare value does not say its type of then
+            self._reply(query, key, payload.value(sample), stamp)
+        else:
+            encoding.reply(query, key, sample, stamp)
 
     def _go_on(self, until: float) -> None:
         if self._ended:
