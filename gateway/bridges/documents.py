@@ -11,6 +11,7 @@ import zenoh
 
 from gateway.tags.timestamps import rfc3339
 
+MOST_ELEMENTS = 65_536  # of an array
 _TEXTS = ("reason", "origin", "limited", "text")
 _EPOCH = 1970  # at its end: a zone may put its first hours before it
 Known = dict[str, Any]  # value, quality, time, and the reason of a bad value: docs/zenoh.md
@@ -28,11 +29,30 @@ def described_by(key: str, payload: bytes) -> Known | None:
     """Returns the description of a tag, None for that of another program."""
     with suppress(ValueError):
         meta = orjson.loads(payload)
-        if isinstance(meta, dict) and isinstance(meta.get("type"), str) and is_name(key):
+        if is_name(key) and _is_description(meta):
             plain = {"unit": "", "description": "", "history": False, "write": None}
             found: Known = plain | meta
             return found
     return None
+
+
+def _is_description(meta: Any) -> bool:
+    """Checks what the bridges use of a description. It has more, and may get more."""
+    if not isinstance(meta, dict) or not isinstance(meta.get("type"), str):
+        return False
+    length = meta.get("length")
+    return (
+        all(isinstance(meta.get(name, ""), str) for name in ("unit", "description"))
+        and all(isinstance(meta.get(name, False), bool) for name in ("history", "event"))
+        and (length is None or (type(length) is int and 0 < length <= MOST_ELEMENTS))
+        and all(_are_limits(meta.get(name)) for name in ("write", "clamp", "range"))
+    )
+
+
+def _are_limits(limits: Any) -> bool:
+    if not isinstance(limits, dict):
+        return limits is None
+    return all(limits.get(end) is None or is_number(limits[end]) for end in ("min", "max"))
 
 
 def is_name(key: str) -> bool:

@@ -244,10 +244,15 @@ class RemotePlant:
             *found, last = [reply.ok for reply in replies] or [None]
             if last is None or not str(last.key_expr).endswith("/page"):
                 raise GatewayError("no gateway has answered")
-            page = orjson.loads(last.payload.to_bytes())
+            try:
+                page = orjson.loads(last.payload.to_bytes())
+                whole, is_complete, place = page["samples"], page["complete"], f"{page['next']}"
+            except (ValueError, TypeError, KeyError):
+                raise GatewayError("the answer is none of a gateway") from None
             read = [self.read(key, *copied(sample)[1:]) for sample in found if sample]
-            if page["samples"] != len(read):
+            if whole != len(read):
                 raise GatewayError("not all samples have arrived")
             yield [known for known in read if known]
-            is_complete = page["complete"]
-            after = f";after={page['next']}"
+            before, after = after, f";after={place}"
+            if after == before and not is_complete:
+                raise GatewayError("the history does not go on")

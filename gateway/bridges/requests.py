@@ -72,12 +72,13 @@ class Requests:
             whole_key = f"{self._prefix}/{key}"
             attachment = sign(name, secret, time or utc_now(), whole_key, payload)
         for reply in await self.ask(key, payload=payload, attachment=attachment):
-            if reply.ok is not None:
-                return dict(orjson.loads(reply.ok.payload.to_bytes()))
-            failed = reply.err
-            if failed and failed.encoding == zenoh.Encoding.APPLICATION_JSON:  # else Zenoh's own
-                known = orjson.loads(failed.payload.to_bytes())
-                return {"outcome": known.pop("error"), **known}
+            with suppress(ValueError, TypeError, KeyError):  # of another program
+                if reply.ok is not None:
+                    return dict(orjson.loads(reply.ok.payload.to_bytes()))
+                failed = reply.err
+                if failed and failed.encoding == zenoh.Encoding.APPLICATION_JSON:
+                    known = dict(orjson.loads(failed.payload.to_bytes()))
+                    return {"outcome": str(known.pop("error")), **known}
         return {"outcome": "unclear", "reason": "no answer: it may or may not have been done"}
 
 
