@@ -230,8 +230,11 @@ class RemotePlant:
             return await self.requests.write(key, value, time, writer)
         return {"outcome": "no-gateway", "reason": "no gateway has described this tag"}
 
-    async def past(self, key: str, bounds: str) -> AsyncIterator[list[Known]]:
-        """Yields the samples of a tag in a range of `_time`, page by page.
+    async def past(
+        self, key: str, bounds: str, size: int = PAGE
+    ) -> AsyncIterator[tuple[list[Known], str | None]]:
+        """Yields the samples of a tag in a range of `_time`, page by page, each with a sentence
+        where damage has taken some.
 
         Only the end of a page tells whether all of it has arrived. Raises `GatewayError` where it
         has not.
@@ -239,7 +242,7 @@ class RemotePlant:
         after, is_complete = "", False
         while not is_complete:
             replies = await self.requests.ask(
-                f"{key}?_time={bounds};page={PAGE}{after}", accept_replies=zenoh.ReplyKeyExpr.ANY
+                f"{key}?_time={bounds};page={size}{after}", accept_replies=zenoh.ReplyKeyExpr.ANY
             )
             *found, last = [reply.ok for reply in replies] or [None]
             if last is None or not str(last.key_expr).endswith("/page"):
@@ -247,12 +250,13 @@ class RemotePlant:
             try:
                 page = orjson.loads(last.payload.to_bytes())
                 whole, is_complete, place = page["samples"], page["complete"], f"{page['next']}"
-            except (ValueError, TypeError, KeyError):
+                lost = page.get("damaged")
+            except (ValueError, TypeError, LookupError, AttributeError):
                 raise GatewayError("the answer is none of a gateway") from None
             read = [self.read(key, *copied(sample)[1:]) for sample in found if sample]
             if whole != len(read):
                 raise GatewayError("not all samples have arrived")
-            yield [known for known in read if known]
+            yield [known for known in read if known], lost
             before, after = after, f";after={place}"
             if after == before and not is_complete:
                 raise GatewayError("the history does not go on")

@@ -4,15 +4,21 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from datetime import UTC, datetime
 
 import pytest
 import zenoh
+from asyncua import ua
+from asyncua.server.internal_server import InternalServer
 
 from gateway.bridges.documents import MOST_ELEMENTS, described_by
+from gateway.bridges.opcua.history import History
 from gateway.bridges.remote_plant import RemotePlant
 from gateway.errors import GatewayError
 from tests.bridges.played import META
 from tests.zenoh_peer import configured, free_endpoint
+
+SPEED = ua.NodeId("mixer/speed", 2)
 
 
 @asynccontextmanager
@@ -72,6 +78,31 @@ async def test_a_history_of_another_program_is_refused(end: str, why: str) -> No
     async with plant(lambda query: query.reply("plant/@gateway/demo/page", end)) as remote:
         with pytest.raises(GatewayError, match=why):
             [page async for page in remote.past("mixer/speed", "[..]")]
+
+
+@pytest.mark.parametrize(
+    "aggregate", [None, "AggregateFunction_Average", "AggregateFunction_Range"]
+)
+async def test_opc_ua_tells_no_history_as_good_that_damage_has_touched(
+    aggregate: str | None,
+) -> None:
+    end = {"samples": 0, "complete": True, "next": "a", "damaged": "70 samples are damaged"}
+    begin, until = datetime(2026, 1, 1, tzinfo=UTC), datetime(2026, 1, 2, tzinfo=UTC)
+    asked = ua.HistoryReadParameters(NodesToRead=[ua.HistoryReadValueId(SPEED)])
+    if aggregate is None:
+        asked.HistoryReadDetails = ua.ReadRawModifiedDetails(False, begin, until)
+    else:
+        of = [ua.NodeId(getattr(ua.ObjectIds, aggregate))]
+        asked.HistoryReadDetails = ua.ReadProcessedDetails(begin, until, 3_600_000.0, of)
+
+    def damaged(query: zenoh.Query) -> None:
+        if "page" in query.parameters:
+            query.reply("plant/@gateway/demo/page", json.dumps(end))
+
+    async with plant(damaged) as remote:
+        remote.tags["mixer/speed"] = META | {"history": True}
+        [result] = await History(InternalServer(), remote).read_history(asked)
+    assert result.StatusCode.value == ua.StatusCodes.BadDataLost
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,9 @@ class Bridge:
         before = self._recovered
         try:
             for key in tags:
-                async for found in self.plant.past(key, f"[{since}..]"):
+                async for found, lost in self.plant.past(key, f"[{since}..]"):
+                    if lost is not None:
+                        say(f"history of {key} since {since}: {lost}")
                     for known in found:
                         self._add(key, known)
                     self._recovered += len(found)

@@ -103,7 +103,9 @@ class Aggregates:
             bucket = orjson.loads(reply.ok.payload.to_bytes())
             buckets[(datetime.fromisoformat(bucket["time"]) - start) // width] = bucket
         if not buckets:  # no sample: or no gateway, which raises an error
-            await anext(self._plant.past(key, bounds))
+            _, lost = await anext(self._plant.past(key, bounds))
+            if lost is not None:
+                raise ua.uaerrors.BadDataLost
         elif start + (max(buckets) + 1) * width < min(stop, datetime.now(UTC) - LATE):
             raise ua.uaerrors.BadCommunicationError  # the end of the answer is missing
 
@@ -123,7 +125,9 @@ class Aggregates:
     ) -> Callable[[int, float], Interval]:
         good: Mapping[int, list[Known]] = defaultdict(list)
         bad, count = set[int](), 0
-        async for page in self._plant.past(key, f"[{_text(start)}..{_text(stop)}["):
+        async for page, lost in self._plant.past(key, f"[{_text(start)}..{_text(stop)}["):
+            if lost is not None:
+                raise ua.uaerrors.BadDataLost
             count += len(page)
             if count > MOST_SAMPLES:
                 raise ua.uaerrors.BadTooManyOperations

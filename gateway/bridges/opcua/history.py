@@ -1,9 +1,7 @@
 """HistoryRead: raw values and aggregates from the history of the gateways."""
 
-import json
 from datetime import UTC, datetime, timedelta
 
-import zenoh
 from asyncua import ua
 from asyncua.common.utils import ServiceError
 from asyncua.server.history import HistoryManager
@@ -99,27 +97,12 @@ class History(HistoryManager):
         return ""
 
     async def _samples(self, key: str, bounds: str, wanted: int | None) -> list[Known]:
-        """Queries page by page: only the end of a page tells whether all of it has arrived."""
+        """Returns at least the first `wanted` samples, or all of them."""
         samples: list[Known] = []
-        after = ""
-        while wanted is None or len(samples) < wanted:
-            replies = await self._plant.requests.ask(
-                f"{key}?_time={bounds};page={wanted or MOST_SAMPLES}{after}",
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-            )
-            if not replies:
-                raise ua.uaerrors.BadNoCommunication
-            *found, last = [reply.ok for reply in replies]
-            if last is None or not str(last.key_expr).endswith("/page"):
-                raise ua.uaerrors.BadCommunicationError
-            page = json.loads(last.payload.to_bytes())
-            if page["samples"] != len(found) or None in found:
-                raise ua.uaerrors.BadCommunicationError
-            if "damaged" in page:
+        async for found, lost in self._plant.past(key, bounds, wanted or MOST_SAMPLES):
+            if lost is not None:
                 raise ua.uaerrors.BadDataLost
-            read = [self._plant.read(key, *copied(sample)[1:]) for sample in found if sample]
-            samples += [known for known in read if known]
-            if page["complete"]:
+            samples += found
+            if wanted is not None and len(samples) >= wanted:
                 break
-            after = f";after={page['next']}"
         return samples
