@@ -149,7 +149,7 @@ def _to_look_at(told: Told, drift: str, newest: tuple[int, ...]) -> Iterator[str
 
 def _version(report: ReportDocument) -> tuple[int, ...]:
     return tuple(
-        int(one) for one in str(report["version"]).split("+")[0].split(".") if one.isdecimal()
+        int(one[:9]) for one in report["version"].split("+")[0].split(".") if one.isdecimal()
     )
 
 

@@ -171,7 +171,8 @@ def gateways(endpoint: str, *names: str) -> Iterator[None]:
     with zenoh.open(setup) as session:
         for name in names:
             key = f"works/@gateway/{name}/report"
-            payload = orjson.dumps(REPORT | {"name": name})
+            strange = {"revision": "=1+1", "version": "9" * 5000}  # of another program
+            payload = orjson.dumps(REPORT | {"name": name} | (strange if name == "c" else {}))
             session.declare_queryable(key, partial(_reply, key, payload))
         yield
 
@@ -195,6 +196,9 @@ def test_the_command_as_a_table_json_and_csv(tmp_path: Path) -> None:
         done = plc_gateway(*asked, "--csv")
         assert done.out.splitlines()[0].startswith("gateway,state,says,drift,clock_offset,")
         assert len(done.out.splitlines()) == 3
+    with gateways(endpoint, "c"):
+        done = plc_gateway("fleet", "works", "--connect", endpoint, "--csv")
+        assert ",'=1+1," in done.out
 
 
 def test_the_page_of_a_gateway_has_those_that_reply_to_its_query(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from gateway.cli.fleet.apply import apply
 from gateway.cli.fleet.place import Connect, Place
 from gateway.cli.fleet.render import render
 from gateway.cli.terminal import FAILED, AsJson, ZenohFile, err, out, printable
+from gateway.config.sheets import neutral
 from gateway.contract.fleet_rows import Row, State, Told, rows, told_by
 from gateway.contract.line_faults import span
 from gateway.errors import GatewayError
@@ -139,5 +140,11 @@ def _print_csv(found: Sequence[Row]) -> None:
     writer = csv.writer(sys.stdout)
     writer.writerow(columns)
     for one in documents:
-        cells = (one.get(name, "") for name in columns)
-        writer.writerow([json.dumps(c) if isinstance(c, dict) else c for c in cells])
+        writer.writerow([_cell(one.get(name, "")) for name in columns])
+
+
+def _cell(value: object) -> object:
+    """A sentence of a gateway may quote what another program has sent."""
+    if isinstance(value, dict):
+        return json.dumps(value)
+    return neutral(value) if isinstance(value, str) else value
