@@ -154,12 +154,12 @@ def test_an_equal_turnaround_plans_nothing(
 ) -> None:
     dev, planned = device([make_tag("D0"), make_tag("D42")]), list[float]()
     monkeypatch.setattr(Device, "plan", lambda self: planned.append(self.turnaround.expected))
-    for turnaround in (0.030, 0.031, 0.029, 0.028, 0.040):
+    for turnaround in (0.030, 0.031, 0.029, 0.028, 0.090):
         dev.record.replies.turnaround = turnaround
         dev.record.exchanges += 50
         dev.learn_turnaround()
         assert dev.turnaround.expected == turnaround
-    assert planned == [0.030, 0.040]
+    assert planned == [0.030, 0.090]
 
 
 def test_a_measured_turnaround_that_changes_the_optimum_plans_again() -> None:

@@ -18,7 +18,7 @@ async def test_two_equal_reads_make_one_good_sample() -> None:
         good = sum(sample.quality is Quality.GOOD for sample in samples)
         reads = sum(data[3:5] == b"51" and b"1CC804" in data for _, data in hall.bench.sent)
         assert good >= 9
-        assert reads == 2 * good
+        assert reads - 2 * good in (0, 1)  # a second read may not have ended
 
 
 @on_virtual_time

@@ -201,7 +201,7 @@ class Device:
     @property
     def transactions(self) -> Transactions:
         """The durations of transactions with this station, for the planner."""
-        return Transactions(self.wire, self.timing, self.turnaround.expected)
+        return Transactions(self.wire, self.timing, self.turnaround.of_plans)
 
     @property
     def longest_poll(self) -> float:
@@ -247,6 +247,7 @@ class Device:
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
+        self.turnaround.replan()
         self.good_reads.replan()
         bad.changed.clear()
         if self.shapes is not None:
@@ -281,6 +282,7 @@ class Device:
                 break
         kept = [block for place, block in enumerate(blocks) if place not in near]
         self.good_reads.replan()
+        self.turnaround.replan()
         found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
         if self.shapes is not None:
@@ -325,15 +327,24 @@ class Device:
     def _most_gain(self) -> float:
         """Returns the load that a new plan can save at most.
 
-        The present plan was the cheapest at its turnaround. A longer one costs it no more than the
-        difference for each of its requests. After a shorter one, a plan with more requests is
-        cheaper by no more than the difference for each additional one.
+        The present plan was the cheapest at its turnaround. After a longer one, a plan with fewer
+        requests is cheaper by no more than the difference for each request that it saves. After a
+        shorter one, it is the same for each additional request.
         """
         change = self.turnaround.change(self.timing.turnaround)
+        if change == 0.0:
+            return 0.0
         requests = sum(1 / block.every for block in self.blocks)
         if change < 0:
             requests -= sum(1 / tag.every for tag in self.polled_tags)
+        elif not (self.monitor.allowed and self._monitored):  # a list needs fewer than any plan
+            requests -= self.turnaround.fewest(self._fewest_requests)
         return requests * change * self.settings.verify_reads
+
+    def _fewest_requests(self) -> float:
+        """Returns the requests a second of the plan that has the fewest."""
+        found = plan(self.tags, self.driver, _alike, self.bad_addresses.cuts)
+        return sum(1 / block.every for block in found)
 
     @property
     def _planning_takes_long(self) -> bool:
@@ -395,3 +406,8 @@ class Device:
             more = math.log2(now - begun) + now / HALF_LIFE
             least, most = sorted((self.use, more))
             self.use = most + math.log2(1.0 + math.exp2(least - most))
+
+
+def _alike(_: Cost) -> float:
+    """Has a plan take the fewest requests."""
+    return 1.0

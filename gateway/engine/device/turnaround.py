@@ -1,11 +1,15 @@
 """The turnaround of a station that plans and forecasts expect."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from gateway.engine.device.records import Record
 
 LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
+# Seconds: plans expect no shorter one. Less wire time than this is not worth another request, nor
+# a new plan while the times of a fast network vary.
+SHORTEST = 0.001
 MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
 
 
@@ -19,6 +23,7 @@ class Turnaround:
     plan_from: int = 0  # number of requests from which on it may be planned again
     _planned: float | None = None  # the one in the last plan; None: the default of the protocol
     _patience: int = 1
+    _fewest: float | None = None  # requests a second of any plan; None: not counted yet
 
     def __post_init__(self) -> None:
         self.expected = self.configured
@@ -36,10 +41,26 @@ class Turnaround:
     def change(self, default: float) -> float:
         """Returns the difference to the one in the last plan. `default`: of the protocol."""
         planned = default if self._planned is None else self._planned
-        return (default if self.expected is None else self.expected) - planned
+        expected = default if self.expected is None else self.expected
+        return max(expected, SHORTEST) - max(planned, SHORTEST)
+
+    @property
+    def of_plans(self) -> float | None:
+        """The one that a plan expects."""
+        return None if self.expected is None else max(self.expected, SHORTEST)
 
     def planned(self, record: Record, *, useful: bool) -> None:
         """Notes a plan with the expected one. The next waits longer if this one was not useful."""
         self._planned = self.expected
         self._patience = 1 if useful else min(2 * self._patience, MOST_PATIENCE)
         self.plan_from = record.exchanges + LEARN_EVERY * self._patience
+
+    def fewest(self, count: Callable[[], float]) -> float:
+        """Returns the requests a second that each plan needs. `count`: counts them, once."""
+        if self._fewest is None:
+            self._fewest = count()
+        return self._fewest
+
+    def replan(self) -> None:
+        """Forgets what holds for the tags and addresses of the last plan only."""
+        self._fewest = None

@@ -14,6 +14,7 @@ from gateway.tags import Sample
 from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
+SLOT = 0.05  # seconds: polls of one slot begin together, so that the program wakes less often
 
 
 @dataclass(slots=True)
@@ -204,7 +205,8 @@ class PollEntry:
             self.due = (asked if self.missed else self.due) + every
         if phases is not None and not self.phased:
             self.phased = True
-            self.due -= every * next(phases)
+            due = self.due - every * next(phases)
+            self.due = due - due % SLOT
         if self.reads.at is None and block.span not in device.bad_addresses.bad:
             self.due_by(now + PAUSE_LONGEST)  # the cause may have gone
 

@@ -36,7 +36,7 @@ class Schedule:
     * A late poll is done once, not once per missed period.
     * A block of a long interval without good values gets an early deadline, in turn with others:
       all these together get a tenth of the wire's time.
-    * After their first round the polls are spread over their periods.
+    * After their first round the polls are spread over their periods, in slots of 50 ms.
     * A device that needs a resync is probed before anything else is sent to it.
     * A starting device is probed at once, first by a short probe. Devices that have replied last
       time go first. While polls of others are due, these probes and those of devices that have
