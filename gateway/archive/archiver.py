@@ -92,7 +92,8 @@ class Follower:
             say(f"{before.gateway}: {why}; between {gap.begin} and {gap.end}")
         if page.is_last:
             after = replace(after, whole=now)
-        is_noted = now - before.whole < NOTE_EVERY * 1e6 or not page.is_last
+        # Not what a clock that was ahead has noted: it would count until then.
+        is_noted = 0 <= now - before.whole < NOTE_EVERY * 1e6 or not page.is_last
         if is_noted and not page.rows and (before.after, before.gaps) == (after.after, after.gaps):
             return
         stored = await self.add(page.rows, before, after)

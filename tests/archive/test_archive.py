@@ -4,9 +4,11 @@ import asyncio
 import json
 import signal
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -181,3 +183,13 @@ def test_wrong_options_are_refused(option: tuple[str, str], tmp_path: Path) -> N
     done = plc_gateway("archive", "run", tmp_path / "archive", *option)
     assert done.code == 2
     assert option[0] in done.err
+
+
+def test_a_clock_that_was_ahead_hides_no_delay(tmp_path: Path) -> None:
+    """It has noted a time of next year: nothing was `behind` until then."""
+    store = store_at(str(tmp_path / "archive"))
+    ahead = round((time.time() + 3e7) * 1e6)
+    begun = Cursor("plant/@gateway/demo")
+    store.add([], begun, replace(begun, after="demo:1f.a0-1-2", whole=ahead))
+    shown = plc_gateway("archive", "status", tmp_path / "archive", "--json")
+    assert json.loads(shown.out)["behind"] is None

@@ -2,12 +2,17 @@
 
 import asyncio
 import json
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import pytest
 import zenoh
 
+from gateway.archive.archiver import Follower, Pace
 from gateway.archive.pages import History, Page, file_of
+from gateway.archive.rows import Row
+from gateway.archive.store import Cursor
 from gateway.errors import GatewayError
 from tests.zenoh_peer import configured, free_endpoint
 
@@ -99,3 +104,25 @@ def test_the_mark_of_a_file_is_in_a_place() -> None:
         "1f.a0",
         "",
     ]
+
+
+@pytest.mark.parametrize("noted_in", [-3600.0, 3e7])
+async def test_a_gateway_without_new_samples_is_noted_as_whole(noted_in: float) -> None:
+    """Also where a clock that was ahead has noted a time of next year."""
+    place, stored = "demo:1f.a0-1-2", asyncio.Event()
+
+    class Idle(History):
+        async def page(self, after: str, size: int) -> Page:
+            return Page([], place, True, True, None, 0)
+
+    async def add(rows: Sequence[Row], before: Cursor, after: Cursor) -> Cursor:
+        assert abs(after.whole / 1e6 - time.time()) < 3000
+        stored.set()
+        return after
+
+    cursor = Cursor(DEMO, place, whole=round((time.time() + noted_in) * 1e6), overlaps=False)
+    history, pages = Idle(cast("zenoh.Session", None), DEMO), asyncio.Semaphore(1)
+    task = asyncio.create_task(Follower(history, cursor, add, Pace(1.0, 10), pages).run())
+    async with asyncio.timeout(300):
+        await stored.wait()
+    task.cancel()

@@ -21,6 +21,7 @@ from gateway.errors import GatewayError
 
 cli = typer.Typer(help="The histories of many gateways in one store.", no_args_is_help=True)
 
+MOST_AHEAD = 60.0  # seconds of the archiver's clock before that of this machine
 _ROUTERS = [ROUTER]  # typer copies it
 _PLACE = "A folder, s3://bucket/folder, postgresql://user@host/database, or an address of InfluxDB."
 Place = Annotated[str, typer.Argument(metavar="STORE", help=_PLACE)]
@@ -84,10 +85,17 @@ def _table(columns: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Tabl
 
 
 def _cells(now: float, cursor: Cursor) -> tuple[str | None, ...]:
-    whole = cursor.whole / 1e6
-    behind = span(max(0.0, now - whole)) if whole else None
+    behind = _behind(cursor, now)
+    shown = None if behind is None else span(behind)
     newest = rfc3339(cursor.newest) if cursor.newest else None
-    return cursor.gateway, str(cursor.samples), _second(newest), behind
+    return cursor.gateway, str(cursor.samples), _second(newest), shown
+
+
+def _behind(cursor: Cursor, now: float) -> float | None:
+    """Returns the seconds since the store had everything; None: it never had, or a clock that was
+    ahead has noted it."""
+    behind = now - cursor.whole / 1e6
+    return max(0.0, round(behind, 1)) if cursor.whole and behind > -MOST_AHEAD else None
 
 
 def _second(time: str | None) -> str | None:
@@ -95,11 +103,10 @@ def _second(time: str | None) -> str | None:
 
 
 def _document(cursor: Cursor, now: float) -> dict[str, object]:
-    """`behind`: seconds since the store had everything; None: it never had."""
     return {
         "gateway": cursor.gateway,
         "samples": cursor.samples,
         "newest": rfc3339(cursor.newest) if cursor.newest else None,
-        "behind": round(max(0.0, now - cursor.whole / 1e6), 1) if cursor.whole else None,
+        "behind": _behind(cursor, now),
         "gaps": [{"from": gap.begin, "to": gap.end, "why": gap.why} for gap in cursor.gaps],
     }
