@@ -1,10 +1,14 @@
 """The session, the messages and the end of a bridge."""
 
 import asyncio
+import faulthandler
 import json
+import os
 import signal
 import sys
+import threading
 from collections.abc import Coroutine, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +17,9 @@ import zenoh
 
 from gateway.errors import ConfigError
 
-CANCEL_EVERY = 3.0  # seconds
+# Seconds after the signal: what runs containers kills them after ten.
+CANCEL_EVERY, END_WITHIN = 4.0, 9.0
+LOOK_EVERY = 0.5  # seconds
 
 
 class Gateways(NamedTuple):
@@ -66,7 +72,9 @@ async def opened(gateways: Gateways) -> zenoh.Session:
             config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
-        config.insert_json5("connect/timeout_ms", "1000")
+        # Each endpoint once, for a second: with a time for all Zenoh waits at the first.
+        config.insert_json5("connect/timeout_ms", "0")
+        config.insert_json5("transport/unicast/open_timeout", "1000")
     except zenoh.ZError as error:
         raise ConfigError(f"{gateways.file or ', '.join(gateways.connect)}: {error}") from None
     while True:
@@ -78,25 +86,58 @@ async def opened(gateways: Gateways) -> zenoh.Session:
 
 
 def run(bridge: Coroutine[Any, Any, None]) -> None:
-    """Runs it until Ctrl-C or SIGTERM, which cancel it.
+    """Runs it until Ctrl-C or SIGTERM, which cancel it. `END_WITHIN` later the process ends.
 
-    Again after a pause: `asyncio.wait_for` of Python 3.11 may lose a cancellation, and libraries
-    use it.
+    The bridge has its own thread: signals are heard also while a call of a library stands still
+    there. First only the bridge is cancelled, which ends its tasks in their order. After
+    `CANCEL_EVERY` all that is left is cancelled, again and again: `asyncio.wait_for` of Python 3.11
+    may lose a cancellation, libraries use it, and a group of tasks cancels its own only once.
     """
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(bridge)
+    last = threading.Timer(END_WITHIN, _end, [loop])
+    last.daemon = True
 
-    async def until_signal() -> None:
-        task, loop = asyncio.ensure_future(bridge), asyncio.get_running_loop()
-
-        def stop() -> None:
-            task.cancel()
-            loop.call_later(CANCEL_EVERY, stop)
-
-        with suppress(NotImplementedError):  # Windows
-            loop.add_signal_handler(signal.SIGTERM, stop)
+    async def ended() -> None:
         await task
 
+    def served() -> None:
+        with suppress(asyncio.CancelledError), asyncio.Runner(loop_factory=lambda: loop) as runner:
+            runner.run(ended())
+
+    def cancel(*tasks: asyncio.Task[Any]) -> None:
+        for one in tasks or asyncio.all_tasks(loop):
+            one.cancel()
+        loop.call_later(CANCEL_EVERY, cancel)
+
+    def stop(*_signal: object) -> None:
+        if not last.is_alive():
+            last.start()
+            # Without Python, should a library hold its lock.
+            faulthandler.dump_traceback_later(END_WITHIN + 1, exit=True)
+            with suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(cancel, task)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with suppress(KeyboardInterrupt, asyncio.CancelledError):
-            asyncio.run(until_signal())
+        with ThreadPoolExecutor(1, "bridge") as thread:
+            ending = thread.submit(served)
+            while not ending.done():
+                wait([ending], LOOK_EVERY)  # a signal just before does not end it
+            ending.result()
     except ExceptionGroup as failed:  # of the tasks of a bridge: the first one ended the others
         raise failed.exceptions[0] from None
+    finally:
+        last.cancel()
+        faulthandler.cancel_dump_traceback_later()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(loop: asyncio.AbstractEventLoop) -> None:
+    """Ends the process, and says for what it has not waited."""
+    names = {getattr(task.get_coro(), "__qualname__", "?") for task in asyncio.all_tasks(loop)}
+    left = [*sorted(names), *(thread.name for thread in threading.enumerate())]
+    say(f"not ended {END_WITHIN:g} s after the signal: the process ends with {', '.join(left)}")
+    faulthandler.dump_traceback()
+    os._exit(1)

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -117,17 +118,58 @@ def test_in_a_standby_group_the_client_tries_the_other_endpoints_first(
         assert rows_of(client, "**") == [("mixer/speed", 1)]
 
 
+def test_the_client_of_a_standby_whose_partner_is_dead_reaches_it(config: Config) -> None:
+    """Neither a closed port nor one that never answers takes the time of the others."""
+    here, closed = free_endpoint(), free_endpoint()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        mute = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        own = replace(config.zenoh, listen=(here,), connect=(closed, mute))
+        standby = replace(config, zenoh=own, standby="hall")
+        failed = pytest.raises(GatewayError, match=f"^{mute} takes connections and does not answer")
+        with failed, connected(standby, print):
+            pass
+        row = ("mixer/speed", good(1), None)
+        with (
+            answering(replace(config, zenoh=own), {"plant/**": saying(row)}),
+            connected(standby, print) as client,
+        ):
+            assert rows_of(client, "**") == [("mixer/speed", 1)]
+
+
+def test_a_wrong_password_beside_a_dead_partner_is_said(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, closed = free_endpoint(), free_endpoint()
+    users = tmp_path / "users.txt"
+    users.write_text("operator:right\n")
+    own = replace(config.zenoh, listen=(here,), connect=(closed,))
+    standby = replace(config, zenoh=own, standby="hall")
+    monkeypatch.setenv("PLC_GATEWAY_CLI_USER", "operator")
+    monkeypatch.setenv("PLC_GATEWAY_CLI_PASSWORD", "wrong")
+    refused = pytest.raises(GatewayError, match=f"^{here} refuses the user operator: the name or")
+    of_gateway = {"user": "demo", "password": "own", "dictionary_file": str(users)}
+    with answering(replace(config, zenoh=own), {}, **of_gateway):
+        with refused, connected(standby, print):
+            pass
+        monkeypatch.setenv("PLC_GATEWAY_CLI_PASSWORD", "right")
+        with connected(standby, print):
+            pass
+
+
 # -- with a Zenoh session in place of the gateway ----------------------------------------------
 
 
 @contextmanager
-def answering(config: Config, answers: Mapping[str, Answer]) -> Iterator[zenoh.Session]:
-    """A Zenoh session at the gateway's endpoint with these queryables."""
+def answering(
+    config: Config, answers: Mapping[str, Answer], **more: object
+) -> Iterator[zenoh.Session]:
+    """A Zenoh session at the gateway's endpoint with these queryables. `more`: of its users."""
     setup = zenoh.Config()
     settings = {
         "mode": "peer",
         "listen/endpoints": list(config.zenoh.listen),
         "scouting/multicast/enabled": False,
+        **{f"transport/auth/usrpwd/{name}": value for name, value in more.items()},
     }
     for path, value in settings.items():
         setup.insert_json5(path, json.dumps(value))
