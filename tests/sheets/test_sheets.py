@@ -167,6 +167,22 @@ def test_labels_of_a_plc_program_have_their_devices_and_types() -> None:
     assert found.notes == ["columns not used: Class, Remark"]
 
 
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("Name,Comment\nspeed,x\n", "no column Address; the titles are Name, Comment"),
+        ("Address,Type\nD1,int16\n", "no column Name, and no Comment to make names of"),
+        ("Name,Address\n,D1\n", "no name"),
+        ("Name,Address\nspeed,\n", "no address: fill it in, or begin a row that is no tag with #"),
+    ],
+)
+def test_an_address_is_required_and_a_name_or_a_comment(text: str, what: str) -> None:
+    assert [mistake.what for mistake in sheet(text).mistakes] == [what]
+    named = sheet("Address,Comment\nD1,Motor speed\n")
+    assert named.tags == {"Motor_speed": {"address": "D1", "description": "Motor speed"}}
+    assert named.mistakes == []
+
+
 def test_two_columns_of_one_meaning_are_a_mistake() -> None:
     columns = columns_of(["Name", "Address", "Scale", "Faktor"], ())
     assert columns.mistakes == [

@@ -68,7 +68,7 @@ def _header(rows: Sequence[Row]) -> Row:
     if not titles_in(best.cells):
         seen = ", ".join(cell for cell in first[0].cells if cell)[:80]
         raise ConfigError(
-            "no row with titles of columns: the first row needs at least Name and Address, "
+            "no row with titles of columns: the first row needs Address, and Name or Comment, "
             f"as `Name;Address;Type;Unit;Scale`. Row {first[0].number} has: {seen}"
         )
     return best
