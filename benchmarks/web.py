@@ -203,7 +203,7 @@ def main() -> None:
     arguments = parser.parse_args()
     sizes = Sizes(arguments.lines, DEVICES, TAGS)
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         port, path = free_port(), Path(folder) / "plant.yaml"
         text = "\n".join(rows(sizes, free_endpoint(), alike=True, alarms=arguments.alarms))
         path.write_text(f'web: {{listen: "127.0.0.1:{port}"}}\n{text}\n')

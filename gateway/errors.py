@@ -27,6 +27,7 @@ GatewayError
 
 from collections.abc import Sequence
 from enum import StrEnum
+from typing import NamedTuple
 
 
 class GatewayError(Exception):
@@ -161,6 +162,17 @@ class Evidence(StrEnum):
     SHAPE = "shape"  # a good frame that answers another request
     TRUNCATED = "truncated"  # a frame without its end
     SLOW = "slow"  # the right reply, after the time-out
+
+
+class Diagnosis(NamedTuple):
+    """The likely cause of a trouble. Programs compare `code`, people read `text`. Both empty: there
+    is none."""
+
+    code: str
+    text: str
+
+
+NO_TROUBLE = Diagnosis("", "")
 
 
 class NoReply(Unclear):

@@ -32,43 +32,50 @@ def coded_faults(documents: Documents) -> Iterator[Fault]:
     for number, row in transfers(documents):
         if _fails(row) and not _waits_for(row, unreachable, documents):
             which = f"transfer {number} ({row['from']} to {row['to']})"
-            yield Fault("transfer", f"{which} is {row['state']}: {row['why']}")
+            yield Fault(
+                "transfer", f"{which} is {row['state']}: {row['why']}", f"transfers/{number}"
+            )
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         where = " or ".join(wanted)
-        yield Fault("no-router", f"Zenoh: not connected to {where}: its clients get no values")
+        text = f"Zenoh: not connected to {where}: its clients get no values"
+        yield Fault("no-router", text, "zenoh")
     yield from _of_parts(documents)
     for setting, document in below("certificates/", documents):
         called = setting if "." in setting else f"zenoh.tls.{setting}"
         if wrong := certificate_fault(called, document):
-            yield Fault("certificate", wrong)
+            yield Fault("certificate", wrong, f"certificates/{setting}")
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
-        yield Fault("history", f"history: {history['state']}")
+        yield Fault("history", f"history: {history['state']}", "history")
     if aside := history.get("aside"):
         what = f"{aside[0]} was moved aside: see `plc-gateway history salvage` and `known`"
-        yield Fault("history", f"history: {what}")
+        yield Fault("history", f"history: {what}", "history")
 
 
 def _of_parts(documents: Documents) -> Iterator[Fault]:
     for part, document in below("parts/", documents):
         if document["why"]:
             again = f"it is tried again in {document['again']} s"
-            yield Fault("part-stopped", f"{part} stopped: {document['why']}; {again}")
+            text = f"{part} stopped: {document['why']}; {again}"
+            yield Fault("part-stopped", text, f"parts/{part}")
         for one in document.get("faults", ()):
-            yield Fault(**one)
+            yield Fault(one["code"], one["text"], f"parts/{part}")
     for door, document in below("doors/", documents):
         if document["trouble"]:
             which = f"door {door} to line {document['line']}"
-            yield Fault("door-closed", f"{which} is closed: {document['trouble']}")
+            text = f"{which} is closed: {document['trouble']}"
+            yield Fault("door-closed", text, f"doors/{door}")
     for way, document in below("notify/", documents):
         if document["trouble"]:
             wait = f"{document['waiting']} messages about alarms wait since {document['oldest']}"
-            yield Fault("notify", f"{way} does not work: {document['trouble']}; {wait}")
+            text = f"{way} does not work: {document['trouble']}; {wait}"
+            yield Fault("notify", text, f"notify/{way}")
     for part, document in below("files/", documents):
         if document["trouble"]:
             effect = "a restart forgets the last changes"
-            yield Fault("not-saved", f"{part} not saved: {document['trouble']}; {effect}")
+            text = f"{part} not saved: {document['trouble']}; {effect}"
+            yield Fault("not-saved", text, f"files/{part}")
 
 
 def certificate_fault(setting: str, document: Document) -> str:
@@ -85,50 +92,72 @@ def certificate_fault(setting: str, document: Document) -> str:
 
 
 def warnings(documents: Documents) -> Iterator[str]:
+    """Yields what is not as it should be, while other values are good, as sentences."""
+    return (one.text for one in coded_warnings(documents))
+
+
+def coded_warnings(documents: Documents) -> Iterator[Fault]:
     """Yields what is not as it should be, while other values are good."""
     unreachable = _unreachable(documents)
-    for _, device in below("devices/", documents):
-        yield from device["refused_addresses"]
+    for name, device in below("devices/", documents):
+        for text in device["refused_addresses"]:
+            yield Fault("addresses-refused", text, f"devices/{name}")
     for line, document in below("lines/", documents):
         devices = _devices_of(document, documents)
         yield from device_warnings(line, [one for one in devices if one[0] not in unreachable])
-        load = document["expected"]["load"]
+        load, about = document["expected"]["load"], f"lines/{line}"
         if load > 1.0:
-            yield f"line {line} is asked for {load:.1f} times what it carries: see `check`"
+            text = f"line {line} is asked for {load:.1f} times what it carries: see `check`"
+            yield Fault("overloaded", text, about)
         calls = document.get("calls") or {}
         if document["open"] and calls.get("in_a_row"):
-            yield f"line {line}: the last call failed: {calls['last_failure']}"
+            text = f"line {line}: the last call failed: {calls['last_failure']}"
+            yield Fault("call-failed", text, about)
     yield from _of_others(documents["status"])
     yield from _held_up(documents, unreachable)
     reload = documents.get("reload", {})
     if reload.get("refused"):
         more = f" and {len(reload['why']) - 1} more" if len(reload["why"]) > 1 else ""
-        yield f"the changed file was refused at {reload['refused']}: {reload['why'][0]}{more}"
+        text = f"the changed file was refused at {reload['refused']}: {reload['why'][0]}{more}"
+        yield Fault("file-refused", text, "reload")
     yield from _of_remote(documents.get("remote/file", {"state": "none"}))
+    yield from _of_times(documents)
+    yield from _of_history(documents)
+
+
+def _of_times(documents: Documents) -> Iterator[Fault]:
     clock = documents.get("clock", {})
     if (ago := clock.get("ago")) is not None and ago < JUMP_SHOWN:
-        yield (
+        text = (
             f"the clock of this machine jumped by {clock['last']:+.1f} s {ago / 60:.0f} min ago: "
             "times before and after it do not belong together"
         )
+        yield Fault("clock-jumped", text, "clock")
     alarms = documents.get("alarms", {})
     if since := alarms.get("flood_since"):
-        yield (
+        text = (
             f"alarm flood since {since[:19]}Z: {alarms['raised_in_10_min']} alarms in 10 min, more "
             "than an operator reads: `plc-gateway alarms`"
         )
+        yield Fault("alarm-flood", text, "alarms")
+
+
+def _of_history(documents: Documents) -> Iterator[Fault]:
     if lost := documents.get("history", {}).get("lost"):
-        yield f"history: {lost} samples were lost since the start"
+        yield Fault("samples-lost", f"history: {lost} samples were lost since the start", "history")
     if (days := disk_days(documents)) is not None and days < DAYS_OF_DISK:
-        yield f"history: its disk is full in {days:.1f} days: make room, or a smaller `max_size`"
+        text = f"history: its disk is full in {days:.1f} days: make room, or a smaller `max_size`"
+        yield Fault("disk-fills", text, "history")
 
 
-def _of_remote(change: Document) -> Iterator[str]:
+def _of_remote(change: Document) -> Iterator[Fault]:
     if change["state"] == "waiting":
         by, until = change["by"], change["until"]
-        yield f"the file of {by} waits for confirmation: it goes back at {until}"
+        text = f"the file of {by} waits for confirmation: it goes back at {until}"
+        yield Fault("file-unconfirmed", text, "remote/file")
     elif change["state"] == "failed":
-        yield f"the file of {change['by']} did not go back: {change['why']}"
+        text = f"the file of {change['by']} did not go back: {change['why']}"
+        yield Fault("file-not-back", text, "remote/file")
 
 
 def disk_days(documents: Documents) -> float | None:
@@ -143,15 +172,17 @@ def disk_days(documents: Documents) -> float | None:
     return float(free / history["bytes"] * kept) if kept > _KEPT_TO_TELL else None
 
 
-def _of_others(status: Document) -> Iterator[str]:
+def _of_others(status: Document) -> Iterator[Fault]:
     """Yields what other programs on Zenoh do instead of this gateway, or beside it."""
     for device, other in status["refused_devices"].items():
-        yield f"{device} is served by another gateway, {other}"
+        text = f"{device} is served by another gateway, {other}"
+        yield Fault("served-elsewhere", text, f"devices/{device}")
     if key := status.get("answered_elsewhere"):
-        yield (
+        text = (
             f"another program answers queries of {key}, such as a storage of Zenoh: its values may "
             "be old and look good"
         )
+        yield Fault("answered-elsewhere", text, "status")
 
 
 def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:
@@ -161,7 +192,7 @@ def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:
         devices = _devices_of(document, documents)
         wrong = () if stands_by(documents) else line_fault(line, document, devices)
         told = device_warnings(line, [one for one in devices if one[0] not in unreachable])
-        found[line] = [one.text for one in wrong], [*told]
+        found[line] = [one.text for one in wrong], [one.text for one in told]
     return found
 
 
@@ -192,7 +223,7 @@ def _waits_for(row: Document, unreachable: set[str], documents: Documents) -> li
     return [one for one in names if one in unreachable or f"devices/{one}" not in documents]
 
 
-def _held_up(documents: Documents, unreachable: set[str]) -> Iterator[str]:
+def _held_up(documents: Documents, unreachable: set[str]) -> Iterator[Fault]:
     """Yields the transfers that wait for a device: their cause is among the faults already."""
     waiting: dict[str, list[str]] = {}
     for number, row in transfers(documents):
@@ -200,7 +231,7 @@ def _held_up(documents: Documents, unreachable: set[str]) -> Iterator[str]:
             waiting.setdefault(devices[0], []).append(number)
     for device, numbers in sorted(waiting.items()):
         rows = f"transfer {numbers[0]} waits" if len(numbers) == 1 else _several(numbers)
-        yield f"{rows} for {device}"
+        yield Fault("transfer-waits", f"{rows} for {device}", f"transfers/{numbers[0]}")
 
 
 def _several(numbers: list[str]) -> str:

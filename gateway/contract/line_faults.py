@@ -21,10 +21,14 @@ Named = tuple[str, Document]
 
 
 class Fault(NamedTuple):
-    """What needs a person. Programs count by `code`, people read `text`."""
+    """What needs a person, or is to look at. Programs count by `code`, people read `text`.
+
+    `about`: the path of the status document that has its figures, such as `devices/mixer`.
+    """
 
     code: str
     text: str
+    about: str = ""
 
 
 def stands_by(documents: Mapping[str, Document]) -> bool:
@@ -38,17 +42,18 @@ def line_fault(line: str, document: Document, devices: Sequence[Named]) -> Itera
     if not document["open"]:
         why = document["trouble"] or "not opened yet"
         past = _past(document, "down_for", "losses")
-        yield Fault("line-down", f"line {line} is down: {why}{past}")
+        yield Fault("line-down", f"line {line} is down: {why}{past}", f"lines/{line}")
         return
     for name, one in devices:
         if is_another(one):
-            yield Fault("wrong-device", f"{name}: {one['diagnosis']}")
+            yield Fault("wrong-device", f"{name}: {one['diagnosis']}", f"devices/{name}")
     silent = [(name, one) for name, one in devices if one["standing"] == "silent"]
     for alike in _alike(silent):
         name, first = alike[0]
         past = _past(first, "silent_for", "silences")
         if len(alike) == 1:
-            yield Fault("device-silent", f"{name} is silent: {first['diagnosis']}{past}")
+            text = f"{name} is silent: {first['diagnosis']}{past}"
+            yield Fault("device-silent", text, f"devices/{name}")
         else:
             number = f"all {len(alike)}" if len(alike) == len(devices) else str(len(alike))
             of_all = "" if len(alike) == len(devices) else f" of {len(devices)}"
@@ -56,6 +61,7 @@ def line_fault(line: str, document: Document, devices: Sequence[Named]) -> Itera
                 "device-silent",
                 f"line {line}: {number}{of_all} devices are silent{_share(alike)}: "
                 f"{first['diagnosis']}{past}: {_names(alike)}",
+                f"lines/{line}",
             )
 
 
@@ -64,18 +70,17 @@ def is_another(device: Document) -> bool:
     return (device.get("identity") or {}).get("verdict") == "wrong"
 
 
-def device_warnings(line: str, devices: Sequence[Named]) -> Iterator[str]:
-    """Yields the diagnoses of devices that reply."""
+def device_warnings(line: str, devices: Sequence[Named]) -> Iterator[Fault]:
+    """Yields the diagnoses of devices that reply. An older gateway gives them no code."""
     told = [(name, one) for name, one in devices if one["diagnosis"] and not is_another(one)]
     for alike in _alike(told):
         name, first = alike[0]
+        code, why = first.get("diagnosis_code", "other"), first["diagnosis"]
         if len(alike) == 1:
-            yield f"{name}: {first['diagnosis']}"
+            yield Fault(code, f"{name}: {why}", f"devices/{name}")
         else:
-            yield (
-                f"line {line}, {len(alike)} devices{_share(alike)}: {first['diagnosis']}: "
-                f"{_names(alike)}"
-            )
+            which = f"line {line}, {len(alike)} devices{_share(alike)}"
+            yield Fault(code, f"{which}: {why}: {_names(alike)}", f"lines/{line}")
 
 
 def span(seconds: float) -> str:

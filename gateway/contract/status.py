@@ -50,13 +50,15 @@ def is_silent(engine: Engine, now: float) -> bool | None:
 def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> DeviceDocument:
     """One device. Times in seconds, counts since the start. `now` by the loop's clock."""
     record, turnaround = device.record, device.record.replies.turnaround
+    diagnosed = device.diagnosed()
     read = [at for poll in polls if (at := poll.reads.at) is not None]
     last_good = max(read, default=record.recent.good)
     return {
         "protocol": device.driver.protocol,
         "station": device.driver.station,
         "standing": standing(device),
-        "diagnosis": device.diagnosis(),
+        "diagnosis": diagnosed.text,
+        "diagnosis_code": diagnosed.code,
         "identity": None if device.identity is None else _identity(device.identity),
         "silent_for": record.falls.lasts(now) if device.health.state is State.OFFLINE else None,
         "silences": record.falls.last_day(now),

@@ -15,7 +15,7 @@ from gateway.engine.device.health import (
 )
 from gateway.engine.device.probe_pace import PAUSE_FIRST, PROBE_PAUSE
 from gateway.engine.schedule.probes import is_noisy
-from gateway.errors import Evidence, Garbled, GatewayError, LineDown, NoReply, Unclear
+from gateway.errors import NO_TROUBLE, Evidence, Garbled, GatewayError, LineDown, NoReply, Unclear
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
 from tests.engine.rig import link_device
@@ -284,13 +284,13 @@ def test_damaged_unsolicited_bytes_are_trouble_until_the_next_good_frame() -> No
 
 
 def test_no_trouble_has_no_diagnosis() -> None:
-    assert diagnosis(None, "other causes") == ""
+    assert diagnosis(None, "other causes") == NO_TROUBLE
 
 
 def test_the_diagnosis_of_silence_adds_the_causes_that_the_protocol_knows() -> None:
-    assert diagnosis(SILENCE, "Is it in RUN?").endswith(" Is it in RUN?")
-    assert diagnosis(SILENCE, "").endswith(".")
+    assert diagnosis(SILENCE, "Is it in RUN?").text.endswith(" Is it in RUN?")
+    assert diagnosis(SILENCE, "").text.endswith(".")
 
 
 def test_other_trouble_is_its_own_diagnosis() -> None:
-    assert diagnosis(LineDown("unplugged"), "other causes") == "unplugged"
+    assert diagnosis(LineDown("unplugged"), "other causes") == ("other", "unplugged")

@@ -137,7 +137,7 @@ def test_what_a_silent_master_wrote_turns_bad_until_it_writes_again() -> None:
     stale = station.expire(made.now + 5, 1)
     assert {sample.tag.name for sample in stale} == {"setpoint", "ramp", "door", "start"}
     assert {sample.reason for sample in stale} == {Reason.NO_REPLY}
-    assert station.diagnosis() == "The master has sent no request to station 1 for 5 s"
+    assert station.diagnosed().text == "The master has sent no request to station 1 for 5 s"
     assert ask(made, "03 0064 0001") == "83 04"  # the master may have started again
     assert made.online_given == [("hmi", True), ("hmi", True)]
     ask(made, "06 0064 0008")
@@ -149,10 +149,10 @@ def test_a_lost_port_turns_what_the_master_wrote_bad() -> None:
     [station] = made.line.stations.values()
     ask(made, "06 0064 0007")
     assert {one.reason for one in station.lost(1, "closed")} == {Reason.LINE_DOWN}
-    assert station.diagnosis() == "The line is down: closed"
+    assert station.diagnosed().text == "The line is down: closed"
     station.opened(made.now)
     assert ask(made, "03 0064 0001") == "83 04"
-    assert station.diagnosis() == ""
+    assert station.diagnosed().text == ""
 
 
 def test_units_of_other_stations_have_no_path_and_a_single_station_has_two_more() -> None:

@@ -81,7 +81,7 @@ def test_each_sentence_of_a_catalogue_is_one_of_the_gateway() -> None:
     trees = [ast.parse(file.read_text()) for file in GATEWAY.rglob("*.py")]
     known = "\n".join(one for tree in trees for one in strings(tree))
     known += "\n".join(file.read_text() for file in ASSETS["page"][0].glob("*.js"))
-    known += diagnosis(NoReply(""), NO_REPLY_CAUSES)
+    known += diagnosis(NoReply(""), NO_REPLY_CAUSES).text
     for words in catalogue("de")["sentences"]:
         for piece in PLACE.split(words)[::2]:
             for one in piece.split(": "):
@@ -105,9 +105,9 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 def test_words_and_diagnoses_of_the_gateway_are_translated() -> None:
     words = [*Reason, *Problem, *Priority, *os_errors._SENTENCES.values(), *ALARM_STATES]
     words = [one for one in words if one not in NOT_SHOWN]
-    words += [diagnosis(NoReply("no reply"), "")]
+    words += [diagnosis(NoReply("no reply"), "").text]
     words += [
-        diagnosis(Garbled("7 bytes", evidence=one), "")
+        diagnosis(Garbled("7 bytes", evidence=one), "").text
         for one in Evidence
         if one is not Evidence.SILENCE
     ]
@@ -194,9 +194,9 @@ DATA = [
     *("speed", "pumps", "plc-gateway", "Ana", "alice", "sensor broken", "int16", "bool", "BUSY"),
     *("<img src=x onerror=alert(1)>", "D0", "tcp/10.0.0.1:7447", "7 bytes", "raw"),
     *("works/north/", "one", "two", "three"),
-    *("modem:/dev/ttyS0", "float64", "D100"),
+    *("modem:/dev/ttyS0", "/dev/ttyS0", "float64", "D100"),
 ]
-NO_BYTE = diagnosis(NoReply("no reply"), "")
+NO_BYTE = diagnosis(NoReply("no reply"), "").text
 DOOR = {"line": "hall", "listen": "0.0.0.0:1503", "protocol": "raw", "trouble": "", "most": 0.3}
 PROGRAM = {"address": "10.1.0.7", "since": 300.0, "requests": 0, "writes": 0, "refused": 0}
 
@@ -205,11 +205,11 @@ def wrong() -> dict[str, Any]:
     """Documents with much that is wrong."""
     lately = {"requests": 200, "failed": {"silence": 150}}
     device = {**DOCUMENTS["devices/oven"], "lately": lately, "diagnosis": NO_BYTE}
-    garbled = diagnosis(Garbled("7 bytes"), "")
+    garbled = diagnosis(Garbled("7 bytes"), "").text
     return {
         "devices/oven": {**device, "silent_for": 4000.0, "silences": 2},
         "devices/mixer": {**device, "silent_for": 40.0},
-        "lines/pumps": calling(open=False, trouble="/dev/ttyS0: no such port"),
+        "lines/pumps": {**calling(), "open": False, "trouble": "/dev/ttyS0: no such port"},
         "lines/hall": {**DOCUMENTS["lines/hall"], "devices": {"mixer": "up", "oven": "silent"}},
         "devices/hall-2": {**DOCUMENTS["devices/mixer"], "diagnosis": garbled},
         "transfers/1": transfer("refused", why="251 is above the greatest value 250"),
@@ -278,7 +278,7 @@ async def test_the_page_has_no_sentence_outside_its_catalogue(
         assert tab.errors == []
 
 
-NOISE = f"{diagnosis(Garbled('7 bytes'), '')} (for 12 s): a, b, c"
+NOISE = f"{diagnosis(Garbled('7 bytes'), '').text} (for 12 s): a, b, c"
 SENTENCES = [
     *("line hall is down: /dev/ttyUSB0: no such port (for 3 h 20 min, 2 times in 24 h)", NO_BYTE),
     "line hall: all 3 devices are silent, no frame to 74% of the last 200 requests: " + NOISE,

@@ -111,6 +111,7 @@ class DeviceDocument(TypedDict):
     station: int
     standing: Standing
     diagnosis: str
+    diagnosis_code: NotRequired[str]
     identity: IdentityDocument | None
     silent_for: NotRequired[float | None]
     silences: NotRequired[int]

@@ -13,7 +13,7 @@ from gateway.engine.device.records import Record
 from gateway.engine.device.reply_shapes import MOST_HELD, GoodReads, ReplyShapes, reply_shapes
 from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.device.turnaround import Turnaround
-from gateway.errors import Evidence, Garbled, LineDown, NoReply
+from gateway.errors import NO_TROUBLE, Diagnosis, Evidence, Garbled, LineDown, NoReply
 from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
@@ -138,23 +138,28 @@ class Device:
 
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
+        return self.diagnosed().text
+
+    def diagnosed(self) -> Diagnosis:
+        """Returns the likely cause of its trouble with its code."""
         driver = self.driver
         trouble = self.health.trouble
         if trouble is None:
-            if self.identity is not None and self.identity.why:
+            if self.identity is not None and self.identity.why.text:
                 return self.identity.why
             if self.shapes is not None and self.shapes.answers_twice:
-                return ANSWERS_TWICE.format(station=driver.station)
+                return Diagnosis("answers-twice", ANSWERS_TWICE.format(station=driver.station))
             if self.one_at_a_time:
-                return f"It takes one request at a time, not {self.window}: set `window: 1`"
-            return ""
+                why = f"It takes one request at a time, not {self.window}: set `window: 1`"
+                return Diagnosis("one-at-a-time", why)
+            return NO_TROUBLE
         if isinstance(trouble, NoReply | Garbled) and trouble.evidence is not Evidence.SLOW:
             trouble = self.record.recent.usual() or trouble
         heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
         if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
-            return SWAPPED
+            return Diagnosis("swapped", SWAPPED)
         if self.record.recent.port_note and not self.health.online:
-            return self.record.recent.port_note
+            return Diagnosis("port-settings", self.record.recent.port_note)
         return diagnosis(trouble, driver.traits.no_reply_causes)
 
     def takes_one_at_a_time(self, only: bool) -> None:

@@ -10,7 +10,16 @@ from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
 from gateway.engine.device.probe_pace import ProbePace
-from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDown, NoReply
+from gateway.errors import (
+    NO_TROUBLE,
+    DeviceError,
+    Diagnosis,
+    Evidence,
+    Garbled,
+    GatewayError,
+    LineDown,
+    NoReply,
+)
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
 
@@ -282,21 +291,22 @@ class Health:
         self.trouble = damage
 
 
-def diagnosis(trouble: GatewayError | None, silent_causes: str) -> str:
-    """Returns the likely cause of the trouble as a sentence; empty when there is none.
+def diagnosis(trouble: GatewayError | None, silent_causes: str) -> Diagnosis:
+    """Returns the likely cause of the trouble.
 
     `silent_causes`: causes of no reply that are special to the protocol.
     """
     match trouble:
         case None:
-            return ""
+            return NO_TROUBLE
         case Garbled() as error:
             found = str(error).partition(": heard")[0]  # the log has the bytes
-            return f"{_ADVICE.get(error.evidence, 'not understood')} ({found})"
+            advice = _ADVICE.get(error.evidence, "not understood")
+            return Diagnosis(error.evidence.value, f"{advice} ({found})")
         case NoReply():
-            return f"{_SILENCE} {silent_causes}".strip()
+            return Diagnosis(Evidence.SILENCE.value, f"{_SILENCE} {silent_causes}".strip())
         case error:
-            return str(error)
+            return Diagnosis("other", str(error))
 
 
 _SILENCE = (

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from gateway.errors import NO_TROUBLE, Diagnosis
+
 NEVER = float("inf")
 RECHECK = 10.0  # seconds between two questions, at least
 SHARE = 0.01  # of the wire time, for all devices of a line together
@@ -32,7 +34,7 @@ class Identity:
     wanted: Mapping[str, str]
     verdict: Verdict = Verdict.UNKNOWN
     told: Mapping[str, Sequence[str]] = field(default_factory=dict)  # of the last reply
-    why: str = ""  # a sentence for people, if it is not right
+    why: Diagnosis = NO_TROUBLE  # if it is not right
     due: float = -NEVER  # when it is asked
     _has_told: bool = False
     _unanswered: int = 0  # questions in a row
@@ -58,12 +60,13 @@ class Identity:
         """Applies a reply. `pause`: seconds until the next question."""
         self._has_told, self._unanswered, self.told = True, 0, told
         others = [name for name, text in self.wanted.items() if text not in told.get(name, ())]
-        self.verdict, self.why = Verdict.RIGHT, ""
+        self.verdict, self.why = Verdict.RIGHT, NO_TROUBLE
         if others:
             self.verdict = Verdict.WRONG
             found = ", ".join(f"{name} {_shown(told.get(name, ()))}" for name in others)
             wanted = ", ".join(f"{name} {self.wanted[name]}" for name in others)
-            self.why = f"Another device replies: it tells {found}; the file says {wanted}"
+            why = f"Another device replies: it tells {found}; the file says {wanted}"
+            self.why = Diagnosis("another-device", why)
         self.due = now + max(pause, RECHECK)
 
     def refused(self, error: str, now: float) -> None:
@@ -71,10 +74,12 @@ class Identity:
         self._unanswered = 0
         if self._has_told:
             self.verdict = Verdict.WRONG
-            self.why = f"Another device replies: it does not tell its identity any more ({error})"
+            why = f"Another device replies: it does not tell its identity any more ({error})"
+            self.why = Diagnosis("another-device", why)
         else:
             self.verdict = Verdict.UNTOLD
-            self.why = f"It cannot tell its identity ({error}): nothing checks which device it is"
+            why = f"It cannot tell its identity ({error}): nothing checks which device it is"
+            self.why = Diagnosis("identity-unchecked", why)
         self.due = now + RECHECK
 
     def unanswered(self, now: float) -> None:
@@ -84,11 +89,13 @@ class Identity:
             self.due = now
         elif self._has_told:
             self.due = now + min(PAUSE * 2 ** (self._unanswered - SILENT_TRIES), RECHECK)
-            self.why = "It is silent about its identity, which it told before"
+            why = "It is silent about its identity, which it told before"
+            self.why = Diagnosis("identity-silent", why)
         else:
             self.verdict, self._silent_until = Verdict.UNTOLD, now + SILENT_FOR
             self.due, self._unanswered = self._silent_until, 0
-            self.why = "It is silent about its identity: nothing checks which device it is"
+            why = "It is silent about its identity: nothing checks which device it is"
+            self.why = Diagnosis("identity-unchecked", why)
 
     def later(self, now: float) -> None:
         """Notes that the device was busy: it is asked again soon."""

@@ -66,12 +66,12 @@ class Identities(Rule):
             return
         before = identity.verdict
         self._applied(identity, result, now)
-        if identity.verdict is not before and identity.why:
-            self._effects.warning("identity doubtful", device=device.name, why=identity.why)
+        if identity.verdict is not before and identity.why.text:
+            self._effects.warning("identity doubtful", device=device.name, why=identity.why.text)
         if identity.verdict is Verdict.WRONG is not before:
             for poll in self._schedule.polls(device):
                 poll.forget(now)
-            self._effects.bad(device.polled_tags, Reason.WRONG_DEVICE, time, identity.why)
+            self._effects.bad(device.polled_tags, Reason.WRONG_DEVICE, time, identity.why.text)
         if not identity.takes_requests:
             for request in self._schedule.requests.withdraw(device):
                 self._effects.unsent(request, wrong_device(device))
@@ -98,5 +98,5 @@ def _question(device: Device) -> Identify:
 
 def wrong_device(device: Device) -> WrongDevice:
     """Returns the outcome of a request that is not sent."""
-    why = "" if device.identity is None else device.identity.why
+    why = "" if device.identity is None else device.identity.why.text
     return WrongDevice(f"{device.name}: {why or 'its identity is not known'}; nothing was sent")

@@ -68,13 +68,14 @@ def served_documents(lines: Iterable[ServedLine], now: float) -> dict[str, Docum
 
 def _station(station: ServedStation, now: float) -> DeviceDocument:
     """One station. The fields of polls are empty: it sends no request."""
-    counts, driver = station.counts, station.driver
+    counts, driver, diagnosed = station.counts, station.driver, station.diagnosed()
     return {
         "protocol": driver.protocol,
         "station": driver.station,
         "served": True,
         "standing": station.presence.value,
-        "diagnosis": station.diagnosis(),
+        "diagnosis": diagnosed.text,
+        "diagnosis_code": diagnosed.code,
         "identity": None,
         "exchanges": counts.requests,
         "writes": counts.writes,

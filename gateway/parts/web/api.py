@@ -13,7 +13,7 @@ from typing import Any
 from aiohttp import web
 
 from gateway.contract import payload
-from gateway.contract.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.faults import Documents, below, coded_faults, coded_warnings, transfers
 from gateway.contract.interfaces import History
 from gateway.contract.past import buckets
 from gateway.contract.past import samples as past
@@ -328,12 +328,13 @@ def _found(
 
 
 def overview(documents: Documents) -> dict[str, Any]:
-    """Returns the state of the gateway, and sentences about what is wrong."""
+    """Returns the state of the gateway, and sentences about what is wrong, also with codes."""
+    told = {"faults": [*coded_faults(documents)], "warnings": [*coded_warnings(documents)]}
     parts = ("status", "zenoh", "outcomes", "history", "standby", "alarms")
     return {
         **{name: documents[name] for name in parts if name in documents},
-        "faults": [*faults(documents)],
-        "warnings": [*warnings(documents)],
+        **{name: [one.text for one in found] for name, found in told.items()},
+        "coded": {name: [one._asdict() for one in found] for name, found in told.items()},
     }
 
 

@@ -48,6 +48,7 @@ _OF_ROUTES = (
     *("DeviceDocument", "AlarmDocument", "AcknowledgeRequest", "WrittenDocument"),
     *("DoorDocument", "DoorRequest"),
 )
+_CODED = _record(dict.fromkeys(("code", "text", "about"), TEXT))
 _OWN: Mapping[str, Schema] = {
     "Error": _record({"error": TEXT}),
     "Failure": {"anyOf": [ref("FailureDocument"), ref("GroupDocument")]},
@@ -57,6 +58,7 @@ _OWN: Mapping[str, Schema] = {
             "zenoh": ref("ZenohDocument"),
             "outcomes": ref("OutcomesDocument"),
             **dict.fromkeys(("faults", "warnings"), _list(TEXT)),
+            "coded": _record(dict.fromkeys(("faults", "warnings"), _list(_CODED))),
         },
         {
             "history": ref("HistoryDocument"),

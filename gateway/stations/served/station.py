@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from gateway.errors import NO_TROUBLE, Diagnosis
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.served.answering import Done
 from gateway.stations.served.registers import Registers
@@ -79,7 +80,7 @@ class ServedStation:
         if now < self._due:
             return ()
         self._due, self.presence = NEVER, Presence.SILENT
-        return self._bad(Reason.NO_REPLY, at, self.diagnosis())
+        return self._bad(Reason.NO_REPLY, at, self.diagnosed().text)
 
     def lost(self, at: int, why: str) -> Sequence[Sample]:
         """Returns bad samples of what the master writes: the wire is lost."""
@@ -90,14 +91,15 @@ class ServedStation:
         self.registers.expire()
         return [bad(tag, reason, at, why) for tag in self.registers.written_tags]
 
-    def diagnosis(self) -> str:
-        """Returns a sentence for people; empty while the master is there."""
+    def diagnosed(self) -> Diagnosis:
+        """Returns why its master is not there; empty while it is."""
         if self.presence is not Presence.SILENT:
-            return ""
+            return NO_TROUBLE
         if self._trouble:
-            return f"The line is down: {self._trouble}"
+            return Diagnosis("line-down", f"The line is down: {self._trouble}")
         since = "since the start" if self.counts.last is None else f"for {self.stale_after:g} s"
-        return f"The master has sent no request to station {self.driver.station} {since}"
+        why = f"The master has sent no request to station {self.driver.station} {since}"
+        return Diagnosis("master-silent", why)
 
 
 def _sample(tag: Tag, value: Value | None, at: int) -> Sample:
