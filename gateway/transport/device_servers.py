@@ -85,7 +85,7 @@ class _Connection(StreamPort):
         self.ended = True
         if self.handshake is not None:
             self.handshake.cancel()
-        self._break(why)
+        self.break_off(why)
 
     def begin(self, connection: socket.socket, files: ServerFiles | None) -> None:
         self.handshake = asyncio.create_task(self._begin(connection, files))

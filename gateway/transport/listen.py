@@ -12,7 +12,7 @@ from gateway.transport.os_errors import line_down
 from gateway.transport.port import Port, Receiver, TcpAddress, named
 from gateway.transport.stream import StreamPort
 from gateway.transport.tcp import configure
-from gateway.transport.tls import ServerFiles, not_begun
+from gateway.transport.tls import ServerFiles, not_begun, watch
 
 log = structlog.get_logger("gateway.line")
 MOST_CONNECTIONS = 32
@@ -163,6 +163,8 @@ async def begin(
                 ssl_handshake_timeout=None if context is None else within + 1.0,
             )
         begun = True
+        if files is not None:
+            watch(port, files.tls)
     except OSError as error:
         raise not_begun(port.name, error) from error
     finally:

@@ -23,22 +23,23 @@ _SENTENCES = {
     errno.ETIMEDOUT: "no answer",
     errno.EMFILE: "too many open files",
 }
+EXPIRED, REVOKED = 10, 23
 # The results of X509_verify_cert of OpenSSL.
-_CERTIFICATES = {
+CERTIFICATES = {
     3: "`tls: revoked` has no list of the authority that signed its certificate",
     9: "its certificate is not valid yet: compare the clocks",
-    10: "its certificate has expired: renew it there, or correct the clock here",
+    EXPIRED: "its certificate has expired: renew it there, or correct the clock here",
     12: "the list of `tls: revoked` has expired: fetch the new one of the authority",
     18: "its certificate is self-signed: give it one of the authority, or name it as `tls: ca`",
     19: "the authority of its certificate is not the one of `tls: ca`",
     20: "the authority of its certificate is not the one of `tls: ca`",
-    23: "its certificate is revoked by `tls: revoked`: give it a new one",
+    REVOKED: "its certificate is revoked by `tls: revoked`: give it a new one",
     26: "its certificate is not made for its side of a connection (extended key usage)",
     62: "its certificate has another name: if it is the right device, write that as `tls: name`",
     64: "its certificate has another address: write a name of it as `tls: name`",
 }
 # 7: another authority of the same name has signed it; 21: the server sends no authority at all.
-_CERTIFICATES[7] = _CERTIFICATES[21] = _CERTIFICATES[20]
+CERTIFICATES[7] = CERTIFICATES[21] = CERTIFICATES[20]
 _REFUSED = "refuses the certificate of this gateway: "
 _ALERTS = {  # by the words of OpenSSL, whose beginnings differ between versions
     "certificate expired": f"{_REFUSED}it has expired: renew it here",
@@ -76,7 +77,7 @@ def line_down(
         case TimeoutError() if error.errno is None:
             return LineDown(f"{name}: no answer")
         case ssl.SSLCertVerificationError():
-            why = _CERTIFICATES.get(error.verify_code)
+            why = CERTIFICATES.get(error.verify_code)
             return LineDown(f"{name}: {why or f'its certificate: {error.verify_message}'}")
         case ssl.SSLError():
             said = (error.reason or str(error)).lower().replace("_", " ")

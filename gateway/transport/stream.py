@@ -68,6 +68,7 @@ class StreamPort(asyncio.Protocol):
         self._loss: LineDown | None = None
         self._transport: asyncio.Transport | None = None
         self._closed = asyncio.Event()
+        self.watching: asyncio.Task[None] | None = None  # the certificate of the other side
 
     def ready(self) -> None:
         """Ends the opening. Raises `LineDown` when the port was lost meanwhile."""
@@ -116,6 +117,13 @@ class StreamPort(asyncio.Protocol):
             async with asyncio.timeout(LONGEST_CLOSE):
                 await self._closed.wait()
 
+    async def is_lost(self, within: float) -> bool:
+        """Waits for the end of the connection, `within` seconds at most."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within):
+                await self._closed.wait()
+        return self._closed.is_set()
+
     # Called by asyncio.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -131,14 +139,15 @@ class StreamPort(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         rate = self._allowance.received(len(data), asyncio.get_running_loop().time())
         if rate:
-            self._break(f"pours {rate:.0f} bytes/s: more than the wire can carry")
+            self.break_off(f"pours {rate:.0f} bytes/s: more than the wire can carry")
             return
         self._receiver.received(data)
 
     def pause_writing(self) -> None:
-        self._break("the other side accepts no data")
+        self.break_off("the other side accepts no data")
 
-    def _break(self, why: str) -> None:
+    def break_off(self, why: str) -> None:
+        """Ends the connection; its receiver is told why."""
         self._loss = self._loss or LineDown(f"{self.name}: {why}")
         if self._transport is not None:
             self._transport.abort()

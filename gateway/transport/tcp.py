@@ -8,7 +8,7 @@ from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
 from gateway.transport.port import KEEPALIVE, Reach, Receiver, TcpAddress, named
 from gateway.transport.stream import StreamPort
-from gateway.transport.tls import begin_tls, make_context
+from gateway.transport.tls import begin_tls, make_context, watch
 
 # A peer without power sends nothing. After the silence of `keepalive` the system sends three times,
 # and waits half of it each time. Sent data must be acknowledged as soon, or the line is down. The
@@ -61,6 +61,7 @@ async def _connect(
     configure(transport.get_extra_info("socket"), where.reach.keepalive)
     if tls is not None and context is not None:
         await begin_tls(port, context, within=by - loop.time(), host=tls.name or place[0])
+        watch(port, tls)
     port.ready()
 
 

@@ -2,13 +2,19 @@
 
 import asyncio
 import ssl
+import time
+from pathlib import Path
+from typing import Any
 
 from gateway.errors import LineDown
-from gateway.transport.os_errors import line_down
+from gateway.transport.asn1 import revoked_numbers
+from gateway.transport.os_errors import CERTIFICATES, EXPIRED, REVOKED, line_down
 from gateway.transport.port import Port, TlsConfig
 from gateway.transport.stream import StreamPort
 
-READ_AGAIN = 60.0  # seconds: renewed files count for new connections, without a restart
+# Seconds. Renewed files count for new connections, without a restart; a list of revoked
+# certificates for open ones, too.
+READ_AGAIN = 60.0
 _NO_TLS = "TLS did not begin: is this its port for TLS? Without TLS write tcp://"
 
 
@@ -39,7 +45,7 @@ class ServerFiles:
     """The certificates of a port of this machine."""
 
     def __init__(self, tls: TlsConfig) -> None:
-        self._tls = tls
+        self.tls = tls
         self._context: ssl.SSLContext | None = None
         self._read_at = 0.0
 
@@ -49,7 +55,7 @@ class ServerFiles:
         if self._context is None or now - self._read_at > READ_AGAIN:
             self._read_at = now
             try:
-                self._context = await asyncio.to_thread(make_context, self._tls, serves=True)
+                self._context = await asyncio.to_thread(make_context, self.tls, serves=True)
             except LineDown:
                 if self._context is None:
                     raise
@@ -94,11 +100,42 @@ def not_begun(name: str, error: OSError) -> LineDown:
     return line_down(name, error)
 
 
+def watch(port: StreamPort, tls: TlsConfig) -> None:
+    """Ends a connection when the certificate of the other side ends, or is revoked: TLS looks at it
+    only once, and a connection lasts for years. Nothing is watched where it has shown none."""
+    if found := _shown_by(port):
+        port.watching = asyncio.create_task(_watch(port, tls, found))
+
+
+async def _watch(port: StreamPort, tls: TlsConfig, found: dict[str, Any]) -> None:
+    ends, number = ssl.cert_time_to_seconds(found["notAfter"]), int(found["serialNumber"], 16)
+    while not await port.is_lost(min(READ_AGAIN, max(0.0, ends - _wall()))):
+        if _wall() >= ends:
+            port.break_off(CERTIFICATES[EXPIRED])
+        elif tls.revoked is not None and number in await asyncio.to_thread(_revoked, tls.revoked):
+            port.break_off(CERTIFICATES[REVOKED])
+
+
+def _revoked(file: Path) -> set[int]:
+    try:
+        return revoked_numbers(file.read_text("ascii", "replace"))
+    except OSError:  # a new connection says so
+        return set()
+
+
+def _wall() -> float:
+    return time.time()
+
+
+def _shown_by(port: StreamPort) -> dict[str, Any]:
+    """Returns the certificate of the other side, as `ssl` shows it; empty: it has shown none."""
+    transport = port.transport
+    return (transport.get_extra_info("peercert") if transport is not None else None) or {}
+
+
 def names_of(port: StreamPort) -> set[str]:
     """Returns the names in the certificate of the other side, in lower case."""
-    transport = port.transport
-    found = transport.get_extra_info("peercert") if transport is not None else None
-    certificate = found or {}
+    certificate = _shown_by(port)
     pairs = [pair for part in certificate.get("subject", ()) for pair in part]
     pairs += certificate.get("subjectAltName", ())
     return {text.lower() for kind, text in pairs if kind in ("commonName", "DNS", "IP Address")}

@@ -3,7 +3,7 @@
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -46,6 +46,7 @@ class Foreign:
     asks: asyncio.Event = field(default_factory=asyncio.Event)  # the gateway has just asked
     unknown_at: float = -1.0  # when an unknown station answered the open question last
     _others: list[tuple[bytes, bytes]] = field(default_factory=list)  # since then, with replies
+    _unknown: list[bytes] = field(default_factory=list)  # replies of an unknown station since then
     second_at: float = -math.inf  # when a second answer to a question was given last
     evidence_at: float = -math.inf  # when a reply to no request arrived last
     _wrong_at: float = -math.inf  # the last wrong scan
@@ -62,6 +63,7 @@ class Foreign:
             self.asked = request
             self._asked.append((now, request))
             self._others.clear()
+            self._unknown.clear()
         if not resync and request not in self.reads and self.shape_of(request):
             self.reads.append(request)
 
@@ -73,12 +75,20 @@ class Foreign:
         """A reply to another master arrived; `unknown`: of an unknown station to the gateway."""
         self.second_at = now
         if unknown:
+            self._unknown.append(reply)
             self._own.append((request, reply))
             if request != self.asked:
                 return
         self._others.append((request, reply))
         if unknown:
             self.unknown_at = now
+
+    def is_alone(self, own: Sequence[bytes], heard: bytes) -> bool:
+        """Only an unknown station has answered: no reply of the right one has arrived yet.
+
+        `own`: what the right one has replied. A reply of both may be the same.
+        """
+        return all(heard.count(reply) <= self._unknown.count(reply) for reply in own)
 
     def wrong_scan(self, now: float) -> Case:
         """Returns what is wrong about a scan with the values of a foreign reply."""

@@ -116,7 +116,8 @@ class Judge:
         self.story.counts[what] += 1
         self.foreign_at[tag] = self.now
         bus.foreign.evidence_at = bus.evidence_at
-        if bus.foreign.unknown_at >= bus.sent_at and not any(map(bus.heard.__contains__, bus.own)):
+        foreign = bus.foreign
+        if foreign.unknown_at >= bus.sent_at and foreign.is_alone(bus.own, bus.heard):
             self.story.counts["foreign answers alone"] += 1
             return
         case = bus.foreign.wrong_scan(self.now)

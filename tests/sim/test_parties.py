@@ -53,6 +53,15 @@ def test_an_answer_before_the_question_can_be_told() -> None:
     assert not foreign.took(b"=2")
 
 
+def test_a_second_station_is_alone_until_a_reply_of_the_first_has_arrived() -> None:
+    """Both may say the same; `hostile` seed 1800012."""
+    foreign = watched()
+    foreign.answered_other(ASK, b"=0", 1.0, unknown=True)
+    assert foreign.is_alone([b"=0"], b"=0")
+    assert not foreign.is_alone([b"=0"], b"=0=0")
+    assert not foreign.is_alone([b"=1"], b"=0=1")
+
+
 def test_a_second_station_answers_for_the_first_only_the_open_question() -> None:
     foreign = watched()
     foreign.answered_other(LIKE, b"=2", 1.0, unknown=True)

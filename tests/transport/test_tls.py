@@ -10,9 +10,11 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from cryptography.x509 import load_pem_x509_certificate
 
 from gateway.errors import LineDown
 from gateway.transport import Port, SerialSettings, TcpAddress, open_port
+from gateway.transport.asn1 import revoked_numbers
 from gateway.transport.device_servers import close_doors
 from gateway.transport.listen import Listener
 from gateway.transport.loop import new_event_loop
@@ -307,3 +309,74 @@ def test_own_files_that_are_wrong_are_said_before_anyone_connects(plant: Authori
         make_context(
             TlsConfig(certificate=certificate, key=plant.folder / "nowhere.key"), serves=True
         )
+
+
+class Told(Greeter):
+    """Tells how its connection ended."""
+
+    def __init__(self) -> None:
+        self.ended = asyncio.get_running_loop().create_future()
+
+    def lost(self, error: Exception) -> None:
+        self.ended.set_result(str(error))
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+@pytest.mark.parametrize("side", ["served", "dialled"])
+@pytest.mark.parametrize("why", ["has expired", "is revoked"])
+def test_an_open_connection_ends_with_the_certificate_of_the_other_side(
+    plant: Authority,
+    loop: Callable[[], asyncio.AbstractEventLoop],
+    monkeypatch: pytest.MonkeyPatch,
+    side: str,
+    why: str,
+) -> None:
+    monkeypatch.setattr("gateway.transport.tls.READ_AGAIN", 0.05)
+    own, stolen = ours(plant), plant.issue("stolen")
+    own = replace(own, revoked=plant.revoke(plant.issue("other")[0]))
+
+    def is_wrong() -> None:
+        if why == "is revoked":
+            plant.revoke(plant.issue("other")[0], stolen[0])
+        else:
+            monkeypatch.setattr("gateway.transport.tls._wall", lambda: 4e9)  # in the year 2096
+
+    async def is_served() -> str:
+        number, told = free_port(), Told()
+        listener = Listener(TcpAddress("127.0.0.1", number, own))
+        await listener.open()
+        served = asyncio.create_task(listener.serve(lambda _: told))
+        shown = client(TlsConfig(ca=plant.ca, certificate=stolen[0], key=stolen[1]))
+        reader, writer = await asyncio.open_connection("127.0.0.1", number, ssl=shown)
+        writer.write(b"?")
+        assert b"stolen" in await reader.read(1000)
+        is_wrong()
+        said: str = await told.ended
+        writer.transport.abort()
+        served.cancel()
+        await listener.close()
+        return said
+
+    async def is_dialled() -> str:
+        heard = RecordingReceiver()
+        with serving(foreign_server(*stolen)) as number:
+            port = await open_port(TcpAddress("127.0.0.1", number, own), ANY, heard)
+            is_wrong()
+            await heard.until(lambda r: bool(r.losses))
+            await port.close()
+        return str(heard.losses[0])
+
+    with asyncio.Runner(loop_factory=loop) as runner:
+        assert f"its certificate {why}" in runner.run(
+            is_served() if side == "served" else is_dialled()
+        )
+
+
+def test_numbers_of_revoked_certificates_are_those_of_the_list(plant: Authority) -> None:
+    shown = [plant.issue(name)[0] for name in ("one", "two")]
+    numbers = {load_pem_x509_certificate(one.read_bytes()).serial_number for one in shown}
+    assert revoked_numbers(plant.revoke(*shown).read_text()) == numbers
+    assert revoked_numbers(plant.revoke().read_text()) == set()
+    begin, _, end = plant.revoke(*shown).read_text().strip().partition("\n")
+    assert revoked_numbers(f"{begin}\n{end[:90]}\n-----END X509 CRL-----") == set()
+    assert revoked_numbers("no list") == revoked_numbers(plant.ca.read_text()) == set()

@@ -14,6 +14,7 @@ from gateway.contract.documents.state import CertificateDocument
 from gateway.contract.faults import certificate_fault
 from gateway.errors import ConfigError
 from gateway.tags.timestamps import rfc3339
+from gateway.transport.asn1 import after, element
 
 DAY = 86_400
 _UTC_TIME, _VERSION, _EXTENSIONS, _UTF8 = 0x17, 0xA0, 0xA3, 0x0C  # tags of ASN.1
@@ -98,20 +99,20 @@ def role(der: bytes) -> str:
     Only that of the extension counts: a name may hold the same bytes.
     """
     try:
-        _, certificate = _element(der)
-        _, fields = _element(certificate)
+        _, certificate = element(der)
+        _, fields = element(certificate)
         while fields[0] != _EXTENSIONS:
-            fields = _after(fields)
-        _, listed = _element(fields)
-        _, rest = _element(listed)
+            fields = after(fields)
+        _, listed = element(fields)
+        _, rest = element(listed)
         while rest:
-            _, extension = _element(rest)
-            rest = _after(rest)
-            if _element(extension)[1] != _ROLE:
+            _, extension = element(rest)
+            rest = after(rest)
+            if element(extension)[1] != _ROLE:
                 continue
-            while more := _after(extension):  # a flag may stand before the value
+            while more := after(extension):  # a flag may stand before the value
                 extension = more
-            tag, text = _element(_element(extension)[1])
+            tag, text = element(element(extension)[1])
             return text.decode() if tag == _UTF8 else ""
     except (IndexError, UnicodeDecodeError):
         pass
@@ -120,36 +121,16 @@ def role(der: bytes) -> str:
 
 def _not_after(der: bytes) -> float:
     """RFC 5280, 4.1: version, serial number, algorithm, issuer, then the validity."""
-    _, certificate = _element(der)
-    _, fields = _element(certificate)
+    _, certificate = element(der)
+    _, fields = element(certificate)
     if fields[0] == _VERSION:
-        fields = _after(fields)
+        fields = after(fields)
     for _ in ("serial number", "algorithm", "issuer"):
-        fields = _after(fields)
-    _, validity = _element(fields)
-    tag, time_of = _element(_after(validity))
+        fields = after(fields)
+    _, validity = element(fields)
+    tag, time_of = element(after(validity))
     form = "%y%m%d%H%M%SZ" if tag == _UTC_TIME else "%Y%m%d%H%M%SZ"
     return datetime.strptime(time_of.decode(), form).replace(tzinfo=UTC).timestamp()
-
-
-def _after(data: bytes) -> bytes:
-    """Returns what follows the first element."""
-    start, size = _place(data)
-    return data[start + size :]
-
-
-def _element(data: bytes) -> tuple[int, bytes]:
-    """Returns tag and content of the first element."""
-    start, size = _place(data)
-    return data[0], data[start : start + size]
-
-
-def _place(data: bytes) -> tuple[int, int]:
-    """Returns start and size of the content of the first element."""
-    if data[1] < 0x80:
-        return 2, data[1]
-    start = 2 + (data[1] & 0x7F)
-    return start, int.from_bytes(data[2:start], "big")
 
 
 @contextmanager
