@@ -17,9 +17,9 @@ from gateway.bridges.program import say
 from gateway.contract.access.named_secrets import NamedSecrets
 from gateway.contract.rate_limit import RateLimit
 
-MOST_CONNECTIONS, MOST_OF_HOST = 200, 50
-MOST_SESSIONS, MOST_OF_USER = 100, 25
-MOST_SUBSCRIPTIONS, MOST_OF_SESSION = 200, 20
+MOST_CONNECTIONS, MOST_OF_HOST = 1_100, 50
+MOST_SESSIONS, MOST_OF_USER = 1_000, 25
+MOST_SUBSCRIPTIONS, MOST_OF_SESSION = 2_000, 20
 MOST_ITEMS, MOST_ITEMS_OF_SESSION = 200_000, 100_000
 MOST_OPERATIONS = 2_500  # nodes in one request
 MOST_MESSAGE = 2 * 2**20  # bytes of a request
