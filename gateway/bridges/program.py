@@ -1,12 +1,9 @@
 """The session, the messages and the end of a bridge."""
 
 import asyncio
-import faulthandler
 import json
-import os
 import signal
 import sys
-import threading
 from collections.abc import Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
@@ -15,11 +12,10 @@ from typing import Any, NamedTuple
 
 import zenoh
 
+from gateway.ending import LastResort
 from gateway.errors import ConfigError
 
-# Seconds after the signal: what runs containers kills them after ten.
-CANCEL_EVERY, END_WITHIN = 4.0, 9.0
-LOOK_EVERY = 0.5  # seconds
+CANCEL_EVERY, LOOK_EVERY = 4.0, 0.5  # seconds
 
 
 class Gateways(NamedTuple):
@@ -86,7 +82,7 @@ async def opened(gateways: Gateways) -> zenoh.Session:
 
 
 def run(bridge: Coroutine[Any, Any, None]) -> None:
-    """Runs it until Ctrl-C or SIGTERM, which cancel it. `END_WITHIN` later the process ends.
+    """Runs it until Ctrl-C or SIGTERM, which cancel it. `LastResort` ends the process after it.
 
     The bridge has its own thread: signals are heard also while a call of a library stands still
     there. First only the bridge is cancelled, which ends its tasks in their order. After
@@ -95,8 +91,7 @@ def run(bridge: Coroutine[Any, Any, None]) -> None:
     """
     loop = asyncio.new_event_loop()
     task = loop.create_task(bridge)
-    last = threading.Timer(END_WITHIN, _end, [loop])
-    last.daemon = True
+    last = LastResort(loop)
 
     async def ended() -> None:
         await task
@@ -111,10 +106,7 @@ def run(bridge: Coroutine[Any, Any, None]) -> None:
         loop.call_later(CANCEL_EVERY, cancel)
 
     def stop(*_signal: object) -> None:
-        if not last.is_alive():
-            last.start()
-            # Without Python, should a library hold its lock.
-            faulthandler.dump_traceback_later(END_WITHIN + 1, exit=True)
+        if last.start():
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(cancel, task)
 
@@ -129,15 +121,5 @@ def run(bridge: Coroutine[Any, Any, None]) -> None:
         raise failed.exceptions[0] from None
     finally:
         last.cancel()
-        faulthandler.cancel_dump_traceback_later()
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _end(loop: asyncio.AbstractEventLoop) -> None:
-    """Ends the process, and says for what it has not waited."""
-    names = {getattr(task.get_coro(), "__qualname__", "?") for task in asyncio.all_tasks(loop)}
-    left = [*sorted(names), *(thread.name for thread in threading.enumerate())]
-    say(f"not ended {END_WITHIN:g} s after the signal: the process ends with {', '.join(left)}")
-    faulthandler.dump_traceback()
-    os._exit(1)

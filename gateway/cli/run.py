@@ -22,6 +22,7 @@ from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, err
 from gateway.config import Config, load
 from gateway.config.share import parse_share
+from gateway.ending import LastResort
 from gateway.errors import ConfigError, GatewayError
 from gateway.parts.web.settings import WebSection
 from gateway.service import service
@@ -93,8 +94,14 @@ def serve(
         tags=tags,
     )
     hint = next_steps(config, path, program())
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    runner = asyncio.Runner(loop_factory=new_event_loop)
+    last = LastResort(runner.get_loop())
+    try:
         runner.run(service.run(config, path, lambda: say(hint), read))
+    finally:
+        last.start()
+        runner.close()  # waits for the threads of the loop: a serial port or a disk may hang
+        last.cancel()
     log.info("gateway stopped")
 
 

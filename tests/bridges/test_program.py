@@ -41,6 +41,7 @@ def test_a_bridge_whose_library_loses_a_cancellation_ends_all_the_same(
 
 HUNG = """
 import asyncio, ctypes, signal, time
+from gateway import ending
 from gateway.bridges import program
 
 async def close(sleep):
@@ -53,7 +54,7 @@ async def bridge():
     print("ready", flush=True)
     await (HOW)
 
-program.END_WITHIN = 0.5
+ending.WITHIN = 0.5
 program.run(bridge())
 """
 

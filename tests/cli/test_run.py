@@ -11,6 +11,7 @@ import pytest
 from gateway.cli.run import next_steps, program
 from gateway.config import load
 from tests.e2e.processes import vigor_line, write_config
+from tests.zenoh_peer import free_endpoint
 
 
 @pytest.mark.parametrize(
@@ -91,3 +92,31 @@ end_beside_zenoh()
 def test_a_thread_that_waits_in_zenoh_is_not_ended_by_python() -> None:
     done = subprocess.run([sys.executable, "-c", WAITING], capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+
+
+HANGING = """
+import asyncio, sys, time
+from pathlib import Path
+from gateway import ending
+from gateway.cli.run import serve
+from gateway.config import load
+from gateway.service import service
+
+async def run(*_arguments):
+    asyncio.create_task(asyncio.to_thread(time.sleep, 300))
+    await asyncio.sleep(0.1)
+
+service.run, ending.WITHIN = run, 0.5
+path = Path(sys.argv[1])
+serve(load(path), path, print)
+"""
+
+
+def test_a_thread_that_hangs_does_not_keep_the_gateway_from_its_end(tmp_path: Path) -> None:
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
+    config = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+    command = [sys.executable, "-c", HANGING, str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 1
+    assert "not ended 0.5 s after the signal: the process ends with " in done.stderr
+    assert "(most recent call first)" in done.stderr

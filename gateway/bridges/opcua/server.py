@@ -14,7 +14,7 @@ from asyncua import Server, ua
 
 from gateway import __version__
 from gateway.bridges.opcua import wire
-from gateway.bridges.opcua.admission import MOST_OPERATIONS, Admission, Quiet
+from gateway.bridges.opcua.admission import MOST_CONNECTIONS, MOST_OPERATIONS, Admission, Quiet
 from gateway.bridges.opcua.aggregates import NAMES
 from gateway.bridges.opcua.bridge import Bridge
 from gateway.bridges.opcua.browsing import MOST_POINTS
@@ -102,6 +102,7 @@ async def bridge(gateways: Gateways, options: Options) -> None:
     _take_log(admission)
     wire.install()
     core = Core(admission)
+    core.max_connections = MOST_CONNECTIONS
     server = Server(iserver=core)
     if own is not None:
         core.certificate, core.private_key = own.certificate, own.key

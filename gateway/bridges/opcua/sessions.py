@@ -16,7 +16,6 @@ from asyncua.server.internal_subscription import InternalSubscription
 
 from gateway.bridges.opcua.admission import (
     EVENT_QUEUE,
-    MOST_CONNECTIONS,
     MOST_ITEMS,
     MOST_ITEMS_OF_SESSION,
     MOST_OF_SESSION,
@@ -59,8 +58,6 @@ class Core(InternalServer):
         self.match_discovery_source_ip = False
         self.min_session_timeout_ms = 10_000.0
         self.max_pending_activation_seconds = 15.0
-        self.max_connections = MOST_CONNECTIONS
-        InternalSession.max_connections = MOST_SESSIONS + 1  # of the class; `is_full` is before it
         self.max_subscriptions = MOST_SUBSCRIPTIONS
         self.max_unacked_messages_per_subscription = 20
         self.max_monitored_item_queue_size = EVENT_QUEUE

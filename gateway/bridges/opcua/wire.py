@@ -14,6 +14,7 @@ from asyncua.common.utils import Buffer, ServiceError
 from asyncua.crypto.security_policies import SecurityPolicyNone
 from asyncua.server import binary_server_asyncio, subscription_service
 from asyncua.server.binary_server_asyncio import OPCUAProtocol
+from asyncua.server.internal_session import InternalSession
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import (
     nodeid_from_binary,
@@ -26,6 +27,7 @@ from gateway.bridges.opcua.admission import (
     MOST_CONNECTIONS,
     MOST_MESSAGE,
     MOST_OF_HOST,
+    MOST_SESSIONS,
 )
 from gateway.bridges.opcua.items import Subscription
 from gateway.bridges.opcua.sessions import Core, Session
@@ -268,3 +270,4 @@ def install() -> None:
     subscription_service.InternalSubscription = Subscription
     binary_server_asyncio.UaProcessor = Processor
     binary_server_asyncio.OPCUAProtocol = Connection
+    InternalSession.max_connections = MOST_SESSIONS + 1  # `Core.is_full` is asked before it
