@@ -13,6 +13,7 @@ from gateway.transport.modem_events import (
     Event,
     Failed,
     ModemSettings,
+    Pins,
     Ready,
     Received,
     Send,
@@ -32,6 +33,7 @@ ABORT_WAIT = 2.0  # seconds for the result of a dial that was broken off
 DTR_TIME = 0.6  # seconds without DTR; S25 of a modem is 50 ms
 RING_TIME = 6.0  # seconds between two rings, at most
 LOST = b"\r\nNO CARRIER"  # the modem's own text in the middle of the data
+CARRIER_WAIT = 0.6  # seconds in which the signal CD must follow that text
 _REFUSALS = (
     *("BUSY", "NO CARRIER", "NO DIALTONE", "NO ANSWER", "ERROR", "DELAYED", "BLACKLISTED"),
     *("VOICE", "FAX", "+CME ERROR", "+FCERROR"),
@@ -50,7 +52,7 @@ class AtModem:
         """`answers`: takes incoming calls."""
         self.state = State.CLOSED
         self.due = NEVER
-        self.dtr = False  # the port has this signal
+        self.pins = Pins()
         self._settings = settings
         self._answers = answers
         self._line = b""  # the begun line of the modem
@@ -182,6 +184,9 @@ class AtModem:
                 self._command(HANG_UP, State.HANGING_UP, now + settings.command_timeout)
             case State.CARRIER_GONE:
                 self._hung_up(now)
+            case State.SAID_GONE:  # a number would go to the station as data
+                self._escapes, self._then = 0, Ready()
+                self._command(SETUP, State.WAKING, now + 2.0)
             case _ if self._escapes < MOST_ESCAPES:
                 self._guard(now)
             case _ if self._waking:
@@ -287,6 +292,7 @@ class AtModem:
     def _connected(self, text: str, now: float) -> None:
         self._events.append(Connected(text))
         self.state, self._held, self._begun, self._heard = State.ONLINE, b"", False, now
+        self.pins.carrier = False
         self._set_due()
 
     def _data(self, data: bytes, now: float) -> None:
@@ -298,7 +304,12 @@ class AtModem:
         place = data.find(LOST)
         if place >= 0:
             self._received(data[:place])
+            if self.pins.carrier:  # a station may say so, too: the signal tells
+                self._held, self.due = data[place:], min(self.due, now + CARRIER_WAIT)
+                return
             self._lost("NO CARRIER")
+            if not self._answers:
+                self.state, self.due = State.SAID_GONE, now + 2 * PAUSE
             return
         kept = _suffix(data)
         self._held = data[len(data) - kept :]
@@ -315,7 +326,7 @@ class AtModem:
         self._rest()
 
     def _online(self, now: float) -> None:
-        if self._held and self._heard + self._settings.hold <= now:
+        if self._held and (self._held.startswith(LOST) or self._heard + self._settings.hold <= now):
             held, self._held = self._held, b""
             self._received(held)
         if self._answers and self._heard + self._settings.idle <= now:
@@ -332,7 +343,7 @@ class AtModem:
     def _begin_hang_up(self, then: Event, now: float) -> None:
         """`then` is reported when the modem has hung up."""
         self._then, self._escapes, self._held = then, 0, b""
-        if self.dtr:
+        if self.pins.dtr:
             self._events.append(SetDtr(False))
             self.state, self.due = State.DROPPING, now + DTR_TIME
         else:

@@ -99,7 +99,7 @@ class ModemPort:
             failed.push_async_callback(self.close)
             self._signals = signals(self._port)
             self._carrier = await self._signals.carrier()
-            self._modem.dtr = self._carrier is not None
+            self._modem.pins.dtr = self._carrier is not None
             await self._ended(self._modem.open)
             failed.pop_all()
 
@@ -127,7 +127,7 @@ class ModemPort:
     async def close(self) -> None:
         """Closes the port of the modem: DTR falls, and the call with it. Else hangs up first."""
         calling = self._modem.state in CALLING
-        if calling and not self._modem.dtr and self._loss is None:
+        if calling and not self._modem.pins.dtr and self._loss is None:
             with suppress(LineDown, TimeoutError):
                 async with asyncio.timeout(2 * self.modem.guard + LONGEST_ANSWER):
                     await self.hang_up()
@@ -233,7 +233,7 @@ class ModemPort:
             if seen and on is False:
                 self._do(self._modem.carrier_lost())
                 return
-            seen = seen or bool(on)
+            self._modem.pins.carrier = seen = seen or bool(on)
             await asyncio.sleep(LOOK)
 
 

@@ -19,6 +19,14 @@ class ModemSettings:
     hold: float = 0.1  # the longest time of the text NO CARRIER on the wire
 
 
+@dataclass(slots=True)
+class Pins:
+    """What the signals of the port show."""
+
+    dtr: bool = False  # the port has this signal
+    carrier: bool = False  # the signal CD is alive, and says that the call is up
+
+
 def dial_command(number: str) -> str:
     """Returns `ATDT` and the number, or `ATDP` where the number begins with P."""
     tone = "" if number[:1] in ("T", "P") else "T"
@@ -100,4 +108,5 @@ class State(Enum):
     GUARDING = auto()  # the silence before +++
     ESCAPING = auto()  # +++ was sent
     HANGING_UP = auto()  # ATH was sent
+    SAID_GONE = auto()  # its text ended the call: perhaps it was data, and the call goes on
     CARRIER_GONE = auto()  # the modem reports it; some say no OK after it

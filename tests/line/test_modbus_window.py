@@ -174,3 +174,49 @@ async def test_a_late_answer_with_a_known_number_is_no_evidence_against_the_pres
     assert dev.record.late == 1
     assert set(dev.record.failures) == {"silence"}
     assert dev.record.unasked == 0
+
+
+@dataclass
+class Queue(Network):
+    """A bridge that passes on one request at a time. A unit that still replies misses the next one,
+    and the bridge waits for it long."""
+
+    kept: list[tuple[bytes, float]] = field(default_factory=list)
+
+    def write(self, data: bytes) -> None:
+        self.sent.append((now(), data))
+        for frame in self.codec.feed(data):
+            self.kept.append((MbapCodec().encode(frame), 6.0 if self.kept else 0.005))
+            if len(self.kept) == 1:
+                self._serve()
+
+    def _serve(self) -> None:
+        asyncio.get_running_loop().call_later(self.kept[0][1], self._served)
+
+    def _served(self) -> None:
+        (request, took), ear = self.kept.pop(0), self.ear
+        assert ear is not None
+        (reply,) = self.station.hear(request, now())
+        if took > 1.0:
+            reply = request[:4] + bytes((0, 3, request[6], request[7] | 0x80, 0x0B))
+        ear.received(reply)
+        if self.kept:
+            self._serve()
+
+
+@on_virtual_time
+async def test_a_bridge_works_through_its_queue_before_it_gets_more() -> None:
+    """Each probe of the device would wait behind the ones before; `hostile` seed 1800014."""
+    dev = windowed(2, every=1.0)
+    queue = Queue()
+    line = plant([dev], wire=NETWORK, bench=queue)
+    witness = Witness(line)
+    async with running(line):
+        await asyncio.sleep(150)  # it is back three times, and loses one of two requests again
+        assert dev.one_at_a_time
+        assert dev.health.online
+        failures = dev.record.failures.total()
+        await asyncio.sleep(60)
+        assert dev.record.failures.total() == failures
+    assert len(queue.kept) <= 1
+    assert witness.wrong == []

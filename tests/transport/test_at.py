@@ -154,7 +154,7 @@ def test_a_call_is_ended_by_the_escape_between_two_guard_times() -> None:
 
 def test_a_call_is_ended_by_dtr_where_there_is_one() -> None:
     bench = Bench()
-    bench.modem.dtr = True
+    bench.modem.pins.dtr = True
     bench.connect()
     bench.note(bench.modem.hang_up(bench.now))
     bench.model.online = False  # it sees the signal
@@ -225,8 +225,34 @@ def test_the_text_of_the_modem_is_no_data(piece: int) -> None:
     bench = Bench(piece=piece)
     bench.connect()
     bench.hear(b"VALUE=12" + bench.model.drop())
-    assert bench.run(5) == [Ended("NO CARRIER")]
+    assert bench.run(5) == [Ended("NO CARRIER"), Ready()]
     assert bench.data == b"VALUE=12"  # without the line end, which would complete the frame
+
+
+def test_a_station_that_says_no_carrier_ends_no_call_that_the_signal_cd_shows() -> None:
+    bench = Bench()
+    bench.connect()
+    bench.modem.pins.carrier = True
+    said = b"ALARM=" + LOST + b"\r\n\x03"
+    bench.hear(said[:20])
+    bench.hear(said[20:])
+    assert bench.run(5) == []
+    assert bench.data == said
+    bench.hear(b"ALARM=" + LOST)
+    bench.note(bench.modem.carrier_lost())
+    assert bench.run(5) == [Ended("NO CARRIER (the signal CD is off)")]
+    assert bench.data == said + b"ALARM="
+
+
+def test_no_number_is_sent_into_a_call_that_a_station_seemed_to_end() -> None:
+    """Without the signal CD the text may be data: the modem is asked, and hangs up if need be."""
+    bench = Bench()
+    bench.connect()
+    bench.hear(b"ALARM=" + LOST + b"\r\n")
+    bench.note(bench.modem.hang_up(bench.now))
+    assert bench.run(60) == [Ended("NO CARRIER"), Ready()]
+    assert not bench.model.online
+    assert b"ATD" not in bench.model.data
 
 
 def test_a_line_end_of_a_station_arrives_a_little_later() -> None:

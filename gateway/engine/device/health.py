@@ -237,6 +237,12 @@ class Health:
             self.unanswered.clear()
             self.restart()
 
+    def replied_to_older(self, now: float) -> None:
+        """Applies a frame of an offline device behind a network, which no request waits for."""
+        if self.state is State.OFFLINE and self.unanswered.sent:
+            sent = self.unanswered.sent.popleft()
+            self.probes.behind(now, now - sent, more=bool(self.unanswered.sent))
+
     def spoke(self, now: float, longest_reply: float) -> None:
         """Notes a sound frame, perhaps of an offline device."""
         if self.state is State.OFFLINE:

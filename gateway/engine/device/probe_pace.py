@@ -8,6 +8,7 @@ PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arriv
 LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
 PROBE_SPREAD = 0.1  # share by which it varies
+MOST_BEHIND = 30.0  # seconds for which no probe is sent, because older ones wait at a server
 
 
 @dataclass(slots=True, eq=False)
@@ -18,6 +19,7 @@ class ProbePace:
     due: float = 0.0
     short: int = 0  # short probes since the last patient one, or the last reply
     patient: bool = False  # the next probe waits for the whole `reply_timeout`: it replies late
+    _behind_until: float = -math.inf  # until then a server has older requests to pass on
     _last: float = -math.inf  # of an offline device
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
     _last_late: float = -math.inf  # a late reply, or one to an older request
@@ -40,12 +42,12 @@ class ProbePace:
         self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
         if self.is_alive(now):
             self.pause = PAUSE_ALIVE
-        self.due = now + self.pause * spread
+        self.due = max(now + self.pause * spread, self._behind_until)
         self._last = now
 
     def may_be_sent(self, now: float) -> bool:
         """Returns True if the last probe is old enough for one on behalf of a client."""
-        return self._last + PAUSE_FIRST <= now
+        return max(self._last + PAUSE_FIRST, self._behind_until) <= now
 
     def is_alive(self, now: float) -> bool:
         """Returns True if damaged replies of the device arrived a short time ago."""
@@ -66,7 +68,12 @@ class ProbePace:
 
     def soon(self) -> None:
         """Shortens the pause, because a client waits."""
-        self.due = min(self.due, self._last + PAUSE_FIRST)
+        self.due = max(min(self.due, self._last + PAUSE_FIRST), self._behind_until)
+
+    def behind(self, now: float, age: float, *, more: bool) -> None:
+        """Notes a reply to a request of this age, from a server that passes on one at a time. Its
+        queue would grow with each probe. `more`: younger requests wait there."""
+        self._behind_until = self.due = now + min(2 * age, MOST_BEHIND) if more else now
 
     def sent(self, *, short: bool) -> None:
         """Counts a probe that is sent."""

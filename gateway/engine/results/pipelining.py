@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
-from gateway.engine.jobs.jobs import Poll, Result, Traffic, Transacted
+from gateway.engine.jobs.jobs import Poll, Probe, Result, Traffic, Transacted
 from gateway.engine.results.rule import Rule
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.errors import Unclear, Unsteady
@@ -32,6 +32,11 @@ class _Window:
         self.suspects, self.alone_until = failed, now + ALONE
         if not failed:
             self.proofs = 0
+
+    def probed(self, now: float) -> None:
+        """Gives the suspects their time: none was polled while the device was offline."""
+        if self.suspects:
+            self.alone_until = now + ALONE
 
     def proved(self) -> None:
         """Counts a suspect that was answered alone."""
@@ -83,6 +88,8 @@ class Pipelining(Rule):
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         """Takes the results of the polls of a transaction, until the last one has ended."""
+        if isinstance(job, Probe) and job.device in self._windows:
+            self._windows[job.device].probed(now)
         if not isinstance(job, Poll) or job.device.window == 1:
             return
         self._ended_polls += 1

@@ -59,6 +59,7 @@ class Stray(Rule):
                 own = [frame for frame in found if frame.station == station]
                 device.record.count_stray(len(own))
                 self._log_frames(device, own, now)
+                self._count_older(device, own, now)
                 if any(_is_extra_reply(device, frame) for frame in own):
                     self._results.spoke(device, now)
                     self._results.answered_twice(device, now, time)
@@ -68,9 +69,18 @@ class Stray(Rule):
         device.record.count_stray()
         self._log_frames(device, [frame], now)
         for each in self._devices:
+            if each.driver.traits.over_network and each.driver.station == frame.station:
+                self._count_older(each, [frame], now)
+        for each in self._devices:
             if not echo and _is_extra_reply(each, frame):
                 self._results.spoke(each, now)
                 self._results.answered_twice(each, now, time)
+
+    @staticmethod
+    def _count_older(device: Device, frames: Sequence[Any], now: float) -> None:
+        """A bridge or device server works through the requests that it has kept."""
+        for _ in frames if device.driver.traits.over_network else ():
+            device.health.replied_to_older(now)
 
     def _log_frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
         """Logs complete frames that are already counted."""
@@ -104,7 +114,8 @@ def _readers(devices: Sequence[Device]) -> dict[object, list[Device]]:
     """Returns the devices whose frames are read, by their codecs: equal ones read bytes once."""
     readers: dict[object, list[Device]] = {}
     for device in devices:
-        if device.shapes is not None or isinstance(device.driver, StrayFrames):
+        readable = isinstance(device.driver, StrayFrames) or device.driver.traits.over_network
+        if device.shapes is not None or readable:
             readers.setdefault(_kind(device.driver.codec()), []).append(device)
     return readers
 
