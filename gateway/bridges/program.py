@@ -68,9 +68,9 @@ async def opened(gateways: Gateways) -> zenoh.Session:
             config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
-        # Each endpoint once, for a second: with a time for all Zenoh waits at the first.
+        # Each endpoint once: with a time for all Zenoh waits at the first. Satellites need 3 s.
         config.insert_json5("connect/timeout_ms", "0")
-        config.insert_json5("transport/unicast/open_timeout", "1000")
+        config.insert_json5("transport/unicast/open_timeout", "5000")
     except zenoh.ZError as error:
         raise ConfigError(f"{gateways.file or ', '.join(gateways.connect)}: {error}") from None
     while True:

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from tests.e2e.paced_link import PacedLink, paced_link
-from tests.e2e.processes import Program, slowed, started, station, vigor_line, write_config
+from tests.e2e.processes import (
+    Program,
+    gateway,
+    plc_gateway,
+    slowed,
+    started,
+    station,
+    vigor_line,
+    write_config,
+)
 from tests.zenoh_peer import Reply, ZenohPeer, free_endpoint
 
 COUNT = 260
@@ -133,3 +142,26 @@ async def test_a_gateway_ends_at_once_beside_a_slow_link(tmp_path: Path) -> None
         asking(slow, radio),
     ):
         assert await asyncio.to_thread(program.end, signal.SIGTERM, slowed(5)) == 0
+
+
+async def test_a_satellite_reaches_gateway_and_router(tmp_path: Path) -> None:
+    """Its round trip takes a second: each of our own programs gave a link up after one second."""
+    endpoint, router = free_endpoint(), free_endpoint()
+    lines = {"hall": vigor_line("simulator", {"count": {"address": "D10"}})}
+    here = write_config(tmp_path / "c.yaml", endpoint, lines)
+    async with (
+        paced_link(endpoint, rate=1_000_000, delay=0.5) as satellite,
+        paced_link(router, rate=1_000_000, delay=0.5) as uplink,
+        ZenohPeer("router", listen=[router]) as far,
+    ):
+        away = {"mode": "client", "listen": [], "connect": [uplink.endpoint]}
+        there = write_config(tmp_path / "client.yaml", endpoint, lines, zenoh=away)
+        read = write_config(tmp_path / "far.yaml", satellite.endpoint, lines)
+        with await asyncio.to_thread(started, there):
+            await far.get_until("plant/mixer/count", lambda known: known["quality"] == "good")
+        with await asyncio.to_thread(started, here):
+            connect = ("--connect", satellite.endpoint)
+            with gateway("bridge", "influx", *connect) as bridge:
+                await asyncio.to_thread(bridge.says, "gateway demo is there")
+            done = await asyncio.to_thread(plc_gateway, "status", read, "--json")
+            assert done.code == 0, done.err

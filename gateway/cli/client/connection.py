@@ -27,10 +27,6 @@ PASSWORD_VARIABLE = "PLC_GATEWAY_CLI_PASSWORD"  # noqa: S105  (the name of a var
 _USER = "transport/auth/usrpwd/user"
 # Settings of the gateway's Zenoh file for its own clients: they must not apply here.
 _OPEN: dict[str, object] = {
-    # Each endpoint once, for a second. With a time for all of them Zenoh's client spends it at the
-    # first one that does not answer, and never tries the others.
-    "connect/timeout_ms": 0,
-    "transport/unicast/open_timeout": 1000,
     "listen/endpoints": [],
     "access_control/enabled": False,
     "transport/auth/usrpwd/dictionary_file": None,

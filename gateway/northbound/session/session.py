@@ -48,18 +48,8 @@ async def open_session(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
                 ) from None
             report = log.warning if pause == _SHORTEST_RETRY else log.debug  # a warning once
             report("Zenoh router unreachable", error=_without_place(error))
-            _begin_with_next(config)
         await asyncio.sleep(pause)
         pause = min(pause * 2, _LONGEST_RETRY)
-
-
-def _begin_with_next(config: zenoh.Config) -> None:
-    """Moves the first of the endpoints to the end: until its time-out Zenoh's client tries only the
-    first one."""
-    endpoints = json.loads(config.get_json("connect/endpoints"))
-    if isinstance(endpoints, list):
-        changed = [*endpoints[1:], *endpoints[:1]]
-        config.insert_json5("connect/endpoints", json.dumps(changed))
 
 
 def _without_place(error: zenoh.ZError) -> str:

@@ -13,6 +13,9 @@ from gateway.contract.access import secrets
 from gateway.errors import ConfigError
 from gateway.northbound.session.exposures import describe_error
 
+# ms until a link is open or given up: with TLS five round trips, over a satellite one second each.
+# Zenoh takes 10 s, which a router behind a dead one would wait for.
+HANDSHAKE = 5000
 # The gateway's defaults, where Zenoh's do not fit. A value in the user's Zenoh file has priority.
 _DEFAULTS: dict[str, object] = {
     "listen/endpoints": [],  # Zenoh's default is every interface
@@ -22,9 +25,10 @@ _DEFAULTS: dict[str, object] = {
     "scouting/gossip/autoconnect": [],  # no links around the router and its access control
     "timestamping/enabled": True,
     "transport/shared_memory/enabled": False,
+    "transport/unicast/open_timeout": HANDSHAKE,
     # Connections that say nothing keep new clients out, 100 of them for 10 s by default.
     "transport/unicast/accept_pending": 400,
-    "transport/unicast/accept_timeout": 3000,  # ms
+    "transport/unicast/accept_timeout": HANDSHAKE,
     "transport/link/tx/lease": 3000,  # ms until the tokens of a frozen gateway end
     # µs. The default of 1 ms silently loses a part of every burst.
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
@@ -59,8 +63,7 @@ def configure(settings: ZenohConfig) -> zenoh.Config:
             config.insert_json5(path, json.dumps(setting))
     config.insert_json5("mode", json.dumps(settings.mode.value))
     if settings.mode is ZenohMode.CLIENT:
-        # Without it, open waits for ever in its thread; `open_session` retries instead.
-        config.insert_json5("connect/timeout_ms", "1000")
+        _try_each_once(config)
     for path, value in (_tls(settings.tls) | _users(settings)).items():
         config.insert_json5(path, json.dumps(value))
     for side, endpoints in (("listen", settings.listen), ("connect", settings.connect)):
@@ -98,8 +101,14 @@ def as_client(config: zenoh.Config) -> zenoh.Config:
     copy = zenoh.Config.from_json5(str(config))
     copy.insert_json5("mode", '"client"')
     copy.insert_json5("listen/endpoints", "[]")
-    copy.insert_json5("connect/timeout_ms", "1000")
+    _try_each_once(copy)
     return copy
+
+
+def _try_each_once(config: zenoh.Config) -> None:
+    """`open_session` retries. With a time for all endpoints Zenoh's client spends it at the first
+    one; without it, for ever, in its thread."""
+    config.insert_json5("connect/timeout_ms", "0")
 
 
 def reachable(endpoint: str) -> str:
