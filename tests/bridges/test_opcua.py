@@ -68,7 +68,8 @@ class Plant(NamedTuple):
         uri: str = URI,
         mode: ua.MessageSecurityMode = ua.MessageSecurityMode.SignAndEncrypt,
     ) -> Client:
-        client = Client(self.url, timeout=60)
+        # Its watchdog would drop the connection when a test uses another token.
+        client = Client(self.url, timeout=60, watchdog_intervall=60)
         client.application_uri = uri
         if user is not None:
             client.set_user(user)
