@@ -116,7 +116,12 @@ class Consumer:
             place = self._places.get(key)
             if place is None:
                 continue
-            fields = orjson.loads(payload)
+            try:
+                fields = orjson.loads(payload)
+            except orjson.JSONDecodeError:
+                found["wrong"] += 1
+                print(f"no JSON on {key} at {arrived - begin:.2f} s: {payload!r}", file=sys.stderr)
+                continue
             if fields["quality"] != "good":
                 found["bad"] += 1
                 continue

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.start import free_ports
+from benchmarks.transactions import has_modbus_serial
 from tests.zenoh_peer import free_endpoint
 
 HERE = Path(__file__).parents[1]
@@ -38,6 +39,7 @@ DRAIN = 1.5  # seconds after it, for what is still on its way
 PATIENCE = 180.0  # seconds for the first values
 QUIET = 0.1  # cores that other programs may use in a quiet run
 TREE = Path(os.environ.get("GATEWAY_TREE", HERE))  # another checkout, to compare
+PYTHON = os.environ.get("GATEWAY_PYTHON", sys.executable)  # another Python for the gateway
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -79,7 +81,7 @@ CHANGING_ONLY = {SCENARIOS["over"], SCENARIOS["blocks"]}
 
 def file(scenario: Scenario, endpoint: str, port: int) -> Iterator[str]:
     """Yields the rows of the gateway's file."""
-    yield from ("gateway: {name: bench}", f"zenoh: {{listen: [{endpoint}], refresh: 52w}}")
+    yield from ("gateway: {name: bench}", f"zenoh: {{listen: [{endpoint}], refresh: 364d}}")
     defaults = f"every: {scenario.every * 1000:g}ms, type: {scenario.kind}, word_order: high_first"
     yield from (f"defaults: {{{defaults}}}", "lines:")
     for line in range(scenario.lines):
@@ -235,7 +237,7 @@ def running(
         assert slaves.line() == "ready"
         begun = time.monotonic()
         log = stack.enter_context((folder / "log").open("w"))
-        command = (sys.executable, "-m", "gateway", "run", path)
+        command = (PYTHON, "-m", "gateway", "run", path)
         each = [("--share", f"{n + 1}/{shares}") if shares > 1 else () for n in range(shares)]
         gateway = Gateways([Program(*command, *one, tree=TREE, log=log) for one in each])
         stack.callback(gateway.stop)
@@ -346,6 +348,62 @@ def measured(
     }
 
 
+# -- peers -----------------------------------------------------------------------------------------
+
+
+MODBUS_SERIAL = "npm's modbus-serial"
+PEERS = {
+    "pymodbus's asyncio client": (sys.executable, "-m", "benchmarks.scenario_peer"),
+    MODBUS_SERIAL: ("node", HERE / "benchmarks" / "scenario_peer.js"),
+}
+
+
+def measured_peer(
+    name: str, scenario: Scenario, *, changing: bool, slave: Path, times: Times
+) -> dict[str, Any]:
+    """Measures another program that reads the same slaves, and publishes nothing."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        port, sizes = free_ports(scenario.lines), (scenario.lines, scenario.units, scenario.tags)
+        record = Path(folder) / "record"
+        slaves = Program(slave, port, *sizes, scenario.kind, int(changing), 0, record)
+        stack.callback(slaves.stop)
+        assert slaves.line() == "ready"
+        peer = Program(*PEERS[name], port, *sizes, scenario.every)
+        stack.callback(peer.stop)
+        time.sleep(times.settle)
+        begin, load, before = time.monotonic(), Load(), peer.used() + slaves.used()
+        first, spent = peer.ask(), peer.used()
+        time.sleep(times.seconds)
+        last, spent, seconds = peer.ask(), peer.used() - spent, time.monotonic() - begin
+        machine = load.end(peer.used() + slaves.used() - before)
+        return {
+            "name": name,
+            "scenario": scenario.name,
+            "changing": changing,
+            "cores": round(spent / seconds, 3),
+            "MB": round(memory(peer.process.pid)),
+            **{key: round((last[key] - first[key]) / seconds) for key in ("read", "changed")},
+            "late": last["late"] - first["late"],
+            "load": machine,
+            "loaded": machine["others"] > QUIET,
+        }
+
+
+def peers(results: dict[str, Any]) -> str:
+    """Returns the table of the peers beside the gateway."""
+    rows = [
+        "| program | scenario | values | cores | MB | values read/s | late rounds |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for one in results.get("peers", ()):
+        note = f" (others used {one['load']['others']} cores)" if one["loaded"] else ""
+        rows.append(
+            f"| {one['name']} | {one['scenario']} | {'change' if one['changing'] else 'stay'}{note}"
+            f" | {one['cores']:.2f} | {one['MB']} | {one['read']:,} | {one['late']} |"
+        )
+    return "\n".join(rows)
+
+
 # -- the table -------------------------------------------------------------------------------------
 
 
@@ -386,14 +444,14 @@ def table(results: dict[str, Any]) -> str:
     ]
     for one in results["scenarios"]:
         values, writes, start = one["values"], one["writes"], one["start"]
-        wrong = _wrong(one)
+        wrongs = wrong(one)
         each = "" if one["us_per_value"] is None else f"{one['us_per_value']:.1f}"
         note = f" (others used {one['load']['others']} cores)" if one["loaded"] else ""
         rows.append(
             f"| {one['name']} | {'change' if one['changing'] else 'stay'}{note} "
             f"| {one['cores']:.2f} | {each} | {one['MB']} "
             f"| {start['seconds']:.1f} ({start['processor']:.1f}) "
-            f"| {values['read']:,} | {values['missing']:,} | {values['twice']:,} | {wrong} "
+            f"| {values['read']:,} | {values['missing']:,} | {values['twice']:,} | {wrongs} "
             f"| {_ms(values['p50'])}, {_ms(values['p99'])} "
             f"| {_ms(writes['p50'])}, {_ms(writes['p99'])}, {_ms(writes['max'])} |"
         )
@@ -404,7 +462,7 @@ def _read(one: dict[str, Any]) -> int:
     return max(1, int(one["values"]["read"]))
 
 
-def _wrong(one: dict[str, Any]) -> int:
+def wrong(one: dict[str, Any]) -> int:
     found = sum(one["values"][name] for name in ("wrong", "wrong time", "out of order"))
     return int(found + one["writes"]["lost"] + one["writes"]["failed"])
 
@@ -424,7 +482,7 @@ AIMS = (
     Aim("start: s of processor", False, 5, lambda one: one["start"]["processor"]),
     Aim("values change: cores", True, 0.8, lambda one: one["cores"]),
     Aim("missing of 1,000", True, 0, lambda one: 1000 * one["values"]["missing"] / _read(one)),
-    Aim("wrong, or a write lost", True, 0, _wrong),
+    Aim("wrong, or a write lost", True, 0, wrong),
     Aim("writes beside it: p99, ms", True, 20, lambda one: 1000 * one["writes"]["p99"]),
 )
 
@@ -446,13 +504,14 @@ def aims(results: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def into_page(results: dict[str, Any]) -> None:
-    text = PAGE.read_text()
-    for mark, made in (("scenarios", table(results)), ("aims", aims(results))):
+def into_page(page: Path, tables: Mapping[str, str]) -> None:
+    """Writes tables between their marks."""
+    text = page.read_text()
+    for mark, made in tables.items():
         before, rest = text.split(f"<!-- {mark} -->")
         after = rest.split(f"<!-- end of {mark} -->")[1]
         text = f"{before}<!-- {mark} -->\n{made}\n<!-- end of {mark} -->{after}"
-    PAGE.write_text(text)
+    page.write_text(text)
 
 
 def main() -> None:
@@ -468,15 +527,17 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="the file for the result")
     parser.add_argument("--table", type=Path, help="print the table of this file")
     parser.add_argument("--docs", action="store_true", help="write the page from the kept result")
+    parser.add_argument("--peers", action="store_true", help="100,000 values by other programs")
     parser.add_argument("--shares", type=int, default=1, help="processes of one file")
     parser.add_argument("--spy", default="", help="a flame graph of the gateway (py-spy)")
     arguments = parser.parse_args()
     if arguments.table is not None:
         kept = json.loads(arguments.table.read_text())
-        print(f"{table(kept)}\n\n{aims(kept)}")
+        print(f"{table(kept)}\n\n{aims(kept)}\n\n{peers(kept)}")
         return
     if arguments.docs:
-        into_page(json.loads(RESULTS.read_text()))
+        kept = json.loads(RESULTS.read_text())
+        into_page(PAGE, {"scenarios": table(kept), "aims": aims(kept), "peers": peers(kept)})
         return
     chosen = [SCENARIOS[name] for name in arguments.only or SCENARIOS]
     if arguments.sizes is not None:
@@ -503,7 +564,15 @@ def main() -> None:
                 )
                 print(json.dumps(one), file=sys.stderr, flush=True)
                 results["scenarios"].append(one)
-    print(f"{table(results)}\n\n{aims(results)}")
+        results["peers"] = [
+            measured_peer(name, scenario, changing=changing, slave=slave, times=times)
+            for name in PEERS
+            if arguments.peers and (name != MODBUS_SERIAL or has_modbus_serial())
+            for scenario in chosen
+            if arguments.sizes is not None or scenario == SCENARIOS["100k"]
+            for changing in changes
+        ]
+    print(f"{table(results)}\n\n{aims(results)}\n\n{peers(results)}")
     if arguments.json is not None:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(results, indent=1) + "\n")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import scenario_clients, scenarios
+from benchmarks import drawing, performance, scenario_clients, scenarios
 from benchmarks.bridges import DOORS
 from tests.conftest import lacking, needs
 from tests.e2e.processes import PATIENCE, ROOT
@@ -140,6 +140,7 @@ TINY = [
 PICTURES = ["pictures", "--after", "0", "--plants", "many", "--sizes", "phone"]
 PICTURES += ["--schemes", "light", "--into"]
 BY_OTHER_TESTS = {
+    "performance",
     "moves",
     "structure",
     "schemas",
@@ -149,9 +150,11 @@ BY_OTHER_TESTS = {
 PARTS_OF_OTHERS = {
     "__init__",
     "checkouts",
+    "drawing",
     "paced_wire",
     "plant_consumer",
     "scenario_clients",
+    "scenario_peer",
     "words",
 }
 
@@ -181,8 +184,9 @@ def test_the_scenarios_check_every_value(tmp_path: Path) -> None:
     needs("cc")
     result = tmp_path / "result.json"
     sizes = ["--sizes", "1", "1", "4", "0.1", "--values", "change"]
-    brief = ["--seconds", "0.3", "--settle", "0.3", "--json", str(result)]
+    brief = ["--seconds", "0.3", "--settle", "0.3", "--peers", "--json", str(result)]
     text = printed("scenarios", *sizes, *brief)
+    assert re.search(r"^\| pymodbus's asyncio client \| 4 at 100 ms .* change", text, re.MULTILINE)
     assert re.search(r"^\| 4 at 100 ms \(1 × 1 × 4\) \| change", text, re.MULTILINE)
     (one,) = json.loads(result.read_text())["scenarios"]
     values = one["values"]
@@ -195,6 +199,29 @@ def test_the_page_has_the_kept_scenarios() -> None:
     kept, page = json.loads(scenarios.RESULTS.read_text()), scenarios.PAGE.read_text()
     assert scenarios.table(kept) in page
     assert scenarios.aims(kept) in page
+    assert scenarios.peers(kept) in page
+
+
+def test_the_gateway_is_measured_against_its_aims(tmp_path: Path) -> None:
+    needs("cc")
+    text = printed("performance", "--tiny", "--json", str(tmp_path / "result.json"))
+    found = json.loads((tmp_path / "result.json").read_text())
+    for row in performance.rows(found):
+        assert f"| {row.name} | {row.aim:g} | " in text
+    for name in ("wrong, or a write lost", "missing of 1,000"):
+        assert re.search(rf"^\| 100,000: {name} \| 0 \| 0 \| met", text, re.MULTILINE), text
+
+
+def test_the_page_has_the_kept_figures() -> None:
+    kept, page = json.loads(performance.RESULTS.read_text()), performance.PAGE.read_text()
+    assert performance.table(kept) in page
+    assert performance.growth(kept) in page
+    assert performance.DRAWING.read_text() == performance.plot(kept)
+
+
+def test_stacks_become_a_flame_graph() -> None:
+    svg = drawing.flames("Runner.run (r.py:1);Line.run (l.py:2) 98\nThread.run (t.py:3) 2\n", "Now")
+    assert re.findall("<title>(.*)</title>", svg) == ["Line.run: 98.0%", "Thread.run: 2.0%"]
 
 
 def test_the_consumer_finds_what_is_wrong() -> None:
