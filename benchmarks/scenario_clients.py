@@ -23,7 +23,8 @@ from benchmarks.start import session as opened
 
 _TIME_BITS = 14  # of a number: milliseconds
 _TIME = (1 << _TIME_BITS) - 1
-_BEFORE = 8.0  # seconds of the record before the first checked one: the values that arrive then
+# Seconds of the record before the first checked one, at least, and rounds: the values that arrive.
+_BEFORE, _ROUNDS = 12.0, 1.6
 _OLDEST = 1.0  # seconds that a time stamp may be older than the reply
 _CLOCKS = 0.005  # seconds that the wall clock may be corrected meanwhile
 WRITABLE = 60_000
@@ -100,11 +101,12 @@ class Consumer:
         self, record: str, begin: float, end: float, *, late: float, changing: bool
     ) -> dict[str, object]:
         """Returns what was wrong of all that arrived. A reply between `begin` and `end` must have
-        arrived, with each of its values once; `late`: seconds after it."""
+        arrived, with each of its values once; `late`: seconds after it, at least one interval."""
         self._keeps = False
+        since = begin - max(_BEFORE, _ROUNDS * late)
         sent = {
             place << _TIME_BITS | ms: at
-            for first, count, ms, at in replies(Path(record), begin - _BEFORE)
+            for first, count, ms, at in replies(Path(record), since)
             for place in range(first, first + count)
         }
         wall = time.time() - time.monotonic()
