@@ -91,12 +91,14 @@ pins: .venv/ready
 	    --constraint constraints-dev.txt
 	$(PINS) --output-file constraints-release.txt --group release --constraint constraints-dev.txt
 	$(PINS) --output-file constraints-ros2.txt --group ros2 --constraint constraints.txt
+	$(PINS) --output-file constraints-s3.txt --group s3
+	sed -i '1i # A server of S3, for the tests of the archive, each package with the hashes of its files.' constraints-s3.txt
 	sed -i '1i # ROS 2, for the tests of its bridge, each package with the hashes of its files.' constraints-ros2.txt
 	sed -i '1i # The packages that the gateway runs with, and hatchling to build it, each with the hashes of its files.' constraints.txt
 	sed -i '1i # The packages of constraints.txt and those of the bridges to MQTT and OPC UA, each with the hashes of its files.' constraints-bridges.txt
 	sed -i '1i # The packages that developers and tests need, with those of constraints.txt, each with the hashes of its files.' constraints-dev.txt
 	sed -i '1i # The packages that build a release, each with the hashes of its files.' constraints-release.txt
-	sed -i $(PINNED) constraints.txt constraints-bridges.txt constraints-dev.txt constraints-release.txt constraints-ros2.txt
+	sed -i $(PINNED) constraints.txt constraints-bridges.txt constraints-dev.txt constraints-release.txt constraints-ros2.txt constraints-s3.txt
 
 # Programs that build a release; in a place of their own.
 build/tools/ready: constraints-release.txt

@@ -86,10 +86,16 @@ QUERIES = {
         "SELECT {day} AS day, key, avg(value) FROM {table} WHERE quality = 'good' GROUP BY 1, 2"
     ),
 }
+OF_POSTGRES = {
+    "the same, by the number of the tag": (
+        "SELECT day, key, mean FROM (SELECT date_trunc('day', time) AS day, tag, avg(value) AS mean"
+        " FROM plc_sample WHERE reason IS NULL GROUP BY 1, 2) AS daily JOIN plc_tag ON id = tag"
+    ),
+}
 
 
-def queries(run: Callable[[str], Sequence[Any]], **words: str) -> None:
-    for name, query in QUERIES.items():
+def queries(run: Callable[[str], Sequence[Any]], wanted: dict[str, str], **words: str) -> None:
+    for name, query in wanted.items():
         begun = time.perf_counter()
         rows = run(query.format(**words))
         print(f"  {name}: {len(rows)} rows in {time.perf_counter() - begun:.2f} s", flush=True)
@@ -105,6 +111,7 @@ def parquet_store() -> Iterator[tuple[Store, Callable[[], None]]]:
             print(f"  {size / 1e6:.0f} MB", flush=True)
             queries(
                 lambda query: duckdb.execute(query).fetchall(),
+                QUERIES,
                 table=files,
                 day="date",
                 hour="date_trunc('hour', time)",
@@ -125,6 +132,7 @@ def postgres_store() -> Iterator[tuple[Store, Callable[[], None]]]:
             print(f"  {size / 1e6:.0f} MB", flush=True)
             queries(
                 server.rows,
+                QUERIES | OF_POSTGRES,
                 table="plc_history",
                 day="date_trunc('day', time)",
                 hour="date_trunc('hour', time)",

@@ -580,6 +580,7 @@ def _example_keys() -> set[str]:
             keys.status("transfers/1"),
             keys.writes,
             keys.page,
+            keys.page_samples,
         ),
         *(
             keys.command(name, command)

@@ -1,13 +1,13 @@
 """Pages of a gateway's history, in the order of recording."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import orjson
 import zenoh
 
 from gateway.archive.rows import Row, row_of
-from gateway.bridges.documents import copied, document_of, is_name
+from gateway.bridges.documents import is_name, is_value
 from gateway.bridges.requests import Requests
 from gateway.errors import GatewayError
 
@@ -56,14 +56,19 @@ class History:
             timeout=ANSWER_WITHIN,
         )
         failed = [reply.err for reply in replies if reply.err is not None]
-        found = [copied(reply.ok) for reply in replies if reply.ok is not None]
-        ends = [payload for key, _, payload, _ in found if key == f"{self.key}/page"]
+        found = [(str(one.ok.key_expr), one.ok.payload.to_bytes()) for one in replies if one.ok]
+        ends = [payload for key, payload in found if key == f"{self.key}/page"]
         if failed or not ends:
             raise GatewayError(_why(failed[0]) if failed else "it does not answer")
         if len(ends) > 1:
             raise GatewayError(f"{len(ends)} gateways have this name: rename one")
-        samples = [one for one in found if one[0] != f"{self.key}/page"]
         try:
+            samples = [
+                sample
+                for key, payload in found
+                if key == f"{self.key}/page/samples"
+                for sample in _samples(orjson.loads(payload))
+            ]
             end = orjson.loads(ends[0])
             whole, again, place = end["samples"], end.get("again", 0), str(end["next"])
             is_last, lost = bool(end["complete"]), end.get("damaged")
@@ -74,15 +79,23 @@ class History:
         if not file_of(place):
             raise GatewayError("its history is not ready")
         samples = samples[: whole - again]
-        rows = [row for key, _, data, _ in samples if (row := _row(key, data)) is not None]
+        rows = [row for sample in samples if (row := _row(*sample)) is not None]
         is_whole = is_last and not again
         return Page(rows, place, is_last, is_whole, lost, len(samples) - len(rows))
 
 
-def _row(key: str, payload: bytes) -> Row | None:
+def _samples(batch: Any) -> Iterator[tuple[object, Any]]:
+    return zip(batch["keys"], batch["values"], strict=True)
+
+
+def _row(key: object, known: Any) -> Row | None:
     """Returns None for what is no sample. Every sample is JSON here, of bare values too."""
-    known = document_of({}, is_put=True, payload=payload, about=b"")
-    return row_of(key, known) if known is not None and is_name(key) else None
+    try:
+        if isinstance(key, str) and is_name(key) and is_value(known):
+            return row_of(key, known)
+    except (KeyError, TypeError, ValueError):
+        pass
+    return None
 
 
 def _why(error: zenoh.ReplyError) -> str:

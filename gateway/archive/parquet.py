@@ -18,10 +18,10 @@ import pyarrow as pa
 from pyarrow import fs
 from pyarrow import parquet as pq
 
-from gateway import files
 from gateway.archive.rows import Row
 from gateway.archive.store import Cursor, Overtaken, StoreDown, cursor_of
 from gateway.errors import ConfigError
+from gateway.files import put
 
 _DAY = 86400 * 10**6  # microseconds
 PART = 250_000  # rows of a file
@@ -51,15 +51,15 @@ class ParquetStore:
     def __init__(self, place: str) -> None:
         try:
             if "://" in place:
-                self._fs, root = fs.FileSystem.from_uri(place)
+                self.files, root = fs.FileSystem.from_uri(place)
             else:
-                self._fs, root = fs.LocalFileSystem(), str(Path(place).absolute())
+                self.files, root = fs.LocalFileSystem(), str(Path(place).absolute())
         except (pa.ArrowInvalid, ValueError) as error:
             raise ConfigError(f"{place}: {error}") from None
         if not (root := root.rstrip("/")):
             raise ConfigError(f"{place} names no folder: s3://bucket/folder, or a folder")
         self.root = root
-        self._is_local = isinstance(self._fs, fs.LocalFileSystem)
+        self._is_local = isinstance(self.files, fs.LocalFileSystem)
         self._last: dict[str, tuple[str, int]] = {}  # of each partition: last part, its rows
 
     def cursors(self) -> Mapping[str, Cursor]:
@@ -67,7 +67,7 @@ class ParquetStore:
         with _failures():
             self._last.clear()
             chosen = fs.FileSelector(f"{self.root}/_archive", allow_not_found=True)
-            for one in self._fs.get_file_info(chosen):
+            for one in self.files.get_file_info(chosen):
                 if one.base_name.endswith(".json"):
                     cursor, _ = self._read(one.path)
                     found[cursor.gateway] = cursor
@@ -136,14 +136,14 @@ class ParquetStore:
     def _found(self, folder: str) -> tuple[str, int]:
         if not (paths := self._parts(folder)):
             return f"{folder}/part-0000.parquet", 0
-        with self._fs.open_input_file(paths[-1]) as file:
+        with self.files.open_input_file(paths[-1]) as file:
             count = pq.ParquetFile(file).metadata.num_rows
         return paths[-1].removeprefix(f"{self.root}/"), count
 
     def _parts(self, folder: str) -> list[str]:
         chosen = fs.FileSelector(f"{self.root}/{folder}", allow_not_found=True)
         return sorted(
-            one.path for one in self._fs.get_file_info(chosen) if one.path.endswith(".parquet")
+            one.path for one in self.files.get_file_info(chosen) if one.path.endswith(".parquet")
         )
 
     def _append(self, folder: str, path: str, count: int, rows: Sequence[Row]) -> None:
@@ -164,12 +164,12 @@ class ParquetStore:
             path = f"{self.root}/{place}"
             with suppress(FileNotFoundError):
                 if not count:
-                    self._fs.delete_file(path)
+                    self.files.delete_file(path)
                 elif (table := self._table(path)).num_rows > count:
                     self._write(path, table.slice(0, count))
 
     def _table(self, path: str, filters: Any = None) -> Any:
-        with self._fs.open_input_file(path) as file:
+        with self.files.open_input_file(path) as file:
             table = pq.read_table(file, filters=filters)
         # Of an earlier version: its columns, and empty ones in place of later ones.
         return pa.concat_tables([table, SCHEMA.empty_table()], promote_options="default")
@@ -185,7 +185,7 @@ class ParquetStore:
         return f"{self.root}/_archive/{_name(gateway)}.json"
 
     def _read(self, path: str) -> tuple[Cursor, Pending]:
-        with self._fs.open_input_file(path) as file:
+        with self.files.open_input_file(path) as file:
             text = file.read()
         try:
             found = orjson.loads(text)
@@ -202,11 +202,11 @@ class ParquetStore:
     def _put(self, path: str, data: Any) -> None:
         """Replaces a file whole. It is on the disk then."""
         if not self._is_local:  # an object of S3 appears when it is complete
-            with self._fs.open_output_stream(path) as stream:
+            with self.files.open_output_stream(path) as stream:
                 stream.write(data)
             return
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        files.put(Path(path), bytes(data), 0o644)
+        put(Path(path), bytes(data), 0o644)
 
 
 def _name(gateway: str) -> str:

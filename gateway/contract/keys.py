@@ -16,6 +16,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/@gateway/<name>/lines/<line>/@trace    the exchanges of a line, while it is watched
     <prefix>/@gateway/<name>/@describe, @introspect    schemas; keys and rights
     <prefix>/@gateway/<name>/page     the last reply to a query with `page`
+    <prefix>/@gateway/<name>/page/samples    samples of a page, many in one reply
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
     …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late
@@ -158,6 +159,11 @@ class Keys:
     def page(self) -> str:
         """The last reply to a query with `page`."""
         return f"{self.own}/page"
+
+    @property
+    def page_samples(self) -> str:
+        """The samples of a page that was queried on `page`."""
+        return f"{self.own}/page/samples"
 
     def group(self, group: str) -> str:
         """The liveliness tokens of one standby group lie below."""

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from tests.archive.servers import Postgres, postgres
+from tests.archive.servers import Postgres, postgres, s3
 from tests.archive.test_archive import (
     Found,
     Hall,
@@ -45,10 +45,8 @@ def archived_in(server: Postgres) -> Found:
 class Campaign:
     """The programs of a plant, each of which can be killed and started again."""
 
-    def __init__(self, folder: Path, server: Postgres | None) -> None:
-        self._endpoint, self._server = free_endpoint(), server
-        self._store: object = folder / "archive" if server is None else server.address
-        self._folder = folder
+    def __init__(self, folder: Path, store: object, server: Postgres | None) -> None:
+        self._endpoint, self._store, self._server = free_endpoint(), store, server
         self._halls = [
             Hall(folder, "demo", self._endpoint, listen=[self._endpoint]),
             Hall(folder, "other", self._endpoint, connect=[self._endpoint], mode="client"),
@@ -110,8 +108,7 @@ class Campaign:
             self._end(name)
 
     def _archived(self) -> Found:
-        store = self._folder / "archive"
-        return archived(store) if self._server is None else archived_in(self._server)
+        return archived(self._store) if self._server is None else archived_in(self._server)
 
     def _count(self) -> int:
         return sum(samples(self._store).values())
@@ -153,13 +150,16 @@ def campaign(store: str, kills: int, seed: int) -> int:
     choice = random.Random(seed)
     with tempfile.TemporaryDirectory() as name, ExitStack() as ends:
         server = ends.enter_context(postgres()) if store == "postgres" else None
-        return Campaign(Path(name), server).run(kills, choice).total()
+        place: object = Path(name) / "archive" if server is None else server.address
+        if store == "s3":
+            place = ends.enter_context(s3())
+        return Campaign(Path(name), place, server).run(kills, choice).total()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200, help="shared by the stores")
-    parser.add_argument("--store", nargs="*", default=["parquet", "postgres"])
+    parser.add_argument("--store", nargs="*", default=["parquet", "s3", "postgres"])
     parser.add_argument("--seed", type=int, default=int(time.time()))
     given = parser.parse_args()
     kills = given.kills // len(given.store)

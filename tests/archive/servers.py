@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ from pathlib import Path
 import psycopg
 
 from tests.conftest import lacking, needs
-from tests.e2e.processes import Program, free_port, until
+from tests.e2e.processes import ROOT, Program, free_port, until
 
 _AS = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups")
 _FAST = ("fsync=off", "full_page_writes=off")  # the tests cut no power
@@ -80,6 +81,20 @@ class Postgres:
 
 def _children(pid: int) -> list[int]:
     return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@contextmanager
+def s3() -> Iterator[str]:
+    """Yields the address of an empty folder on a server of S3 (moto), in memory."""
+    server, port = ROOT / "build" / "s3" / "bin" / "moto_server", free_port()
+    if not server.exists():
+        lacking("there is no moto in build/s3 (.ci/install-peers)")
+    with Program(server, "-p", port) as program:
+        program.says("Running on")
+        bucket = urllib.request.Request(f"http://127.0.0.1:{port}/plant", method="PUT")
+        urllib.request.urlopen(bucket, timeout=60).close()  # noqa: S310  (our own)
+        options = f"region=us-east-1&scheme=http&endpoint_override=127.0.0.1:{port}"
+        yield f"s3://user:of-a-test@plant/archive?{options}"
 
 
 @contextmanager

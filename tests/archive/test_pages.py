@@ -23,10 +23,21 @@ END = {"samples": 2, "complete": True, "next": "demo:1f.a0-1-2"}
 
 def told(query: zenoh.Query, *documents: object) -> None:
     """Replies with samples, and with a last document on the key of the query."""
-    *samples, end = (json.dumps(document) for document in documents)
-    for sample in samples:
-        query.reply("plant/mixer/speed", sample)
-    query.reply(f"{DEMO}/page", end)
+    *samples, end = documents
+    batch(query, dict.fromkeys(["plant/mixer/speed"], samples))
+    query.reply(f"{DEMO}/page", json.dumps(end))
+
+
+def batch(query: zenoh.Query, samples: dict[str, list[object]]) -> None:
+    """Replies with the samples of each key."""
+    pairs = [(key, value) for key, values in samples.items() for value in values]
+    keys, values = zip(*pairs, strict=True) if pairs else ((), ())
+    query.reply(f"{DEMO}/page/samples", json.dumps({"keys": keys, "values": values}))
+
+
+def uneven(query: zenoh.Query) -> None:
+    query.reply(f"{DEMO}/page/samples", '{"keys": ["plant/mixer/speed"], "values": []}')
+    told(query, END)
 
 
 def refuses(query: zenoh.Query) -> None:
@@ -63,6 +74,7 @@ async def asked(answer: Callable[[zenoh.Query], None]) -> Page:
         (twice, "2 gateways have this name: rename"),
         (lambda query: told(query, SAMPLE, {"samples": 1}), "its answer is none of a gateway"),
         (lambda query: told(query, [1]), "its answer is none of a gateway"),
+        (uneven, "its answer is none of a gateway"),
         (
             lambda query: told(query, SAMPLE, SAMPLE, END | {"next": "demo:-0-0"}),
             "its history is not ready",
@@ -90,8 +102,8 @@ async def test_a_key_that_no_database_takes_is_strange() -> None:
     """A NUL in it would stop the archive of its gateway for ever."""
 
     def answer(query: zenoh.Query) -> None:
-        for key in ("plant/mixer/speed", "plant/mixer/a\0b", "plant/mixer/a\nb"):
-            query.reply(key, json.dumps(SAMPLE))
+        keys = ("plant/mixer/speed", "plant/mixer/a\0b", "plant/mixer/a\nb")
+        batch(query, {key: [SAMPLE] for key in keys})
         query.reply(f"{DEMO}/page", json.dumps(END | {"samples": 3}))
 
     page = await asked(answer)

@@ -2,7 +2,7 @@
 
 import asyncio
 import sqlite3
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
@@ -49,10 +49,18 @@ async def serving(folder: Path, endpoint: str) -> AsyncIterator[Program]:
 def shown(replies: list[Reply]) -> list[str]:
     """Returns the good samples: the start of the gateway is in history too."""
     return [
-        f"{reply.key.removeprefix('plant/')} {reply.json['value']}"
-        for reply in replies
-        if reply.key and reply.json.get("quality") == "good"
+        f"{key.removeprefix('plant/')} {known['value']}"
+        for key, known in samples(replies)
+        if known.get("quality") == "good"
     ]
+
+
+def samples(replies: list[Reply]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for reply in replies:
+        if reply.key == "plant/@gateway/demo/page/samples":
+            yield from zip(reply.json["keys"], reply.json["values"], strict=True)
+        elif reply.key:
+            yield reply.key, reply.json
 
 
 async def page(client: ZenohPeer, selector: str) -> tuple[list[str], dict[str, Any]]:
@@ -60,7 +68,7 @@ async def page(client: ZenohPeer, selector: str) -> tuple[list[str], dict[str, A
     replies = await client.get(selector, accept_replies="ANY")
     [end] = [reply for reply in replies if reply.key == "plant/@gateway/demo/page"]
     replies.remove(end)
-    assert end.json["samples"] == len(replies)
+    assert end.json["samples"] == len([*samples(replies)])
     return shown(replies), end.json
 
 

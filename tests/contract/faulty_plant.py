@@ -98,6 +98,7 @@ QUERIES = {
         "plant/@gateway/*/@describe",
         "plant/@gateway/*/@introspect",
         "plant/mixer/**?page=3",
+        "plant/@gateway/demo/page?_time=[..];page=3",
         "plant/mixer/speed?max_age=0s",
         "plant/mixer/speed?max_age=never",
     ],

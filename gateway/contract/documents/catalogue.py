@@ -75,6 +75,7 @@ KINDS = (
     DocumentKind("past values", _TAG, (PAST,), values.ValueDocument),
     DocumentKind("past values: bucket", _TAG, (PAST,), values.BucketDocument),
     DocumentKind("page", own("page"), (GET,), values.PageDocument),
+    DocumentKind("page: samples", own("page/samples"), (GET,), values.PageSamples),
     DocumentKind("block", "{device}/@block", _SEEN, values.BlockDocument),
     DocumentKind(PLACE, "{device}/@block", (SUBSCRIBE,), values.PlaceDocument),
     DocumentKind("meta", f"{_TAG}/@meta", (GET,), values.MetaDocument),

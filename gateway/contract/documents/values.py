@@ -160,6 +160,13 @@ class BucketDocument(TypedDict):
     origin: NotRequired[Origin]
 
 
+class PageSamples(TypedDict):
+    """Samples of a page: the key and the value of each, in the order of recording."""
+
+    keys: list[str]
+    values: list[ValueDocument]
+
+
 class PageDocument(TypedDict):
     """The last reply to a query with `page`."""
 

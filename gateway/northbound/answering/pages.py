@@ -5,7 +5,7 @@ samples, so that the client knows that it has all of them. Several gateways answ
 with its own document: `after` then has the `next` of each, with commas between them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import orjson
@@ -17,6 +17,7 @@ from gateway.tags import Tag
 from gateway.tags.recorded import Place
 
 LARGEST = 100_000  # replies
+_BATCH = 16_384  # bytes of a reply with many samples: what waits behind it on a link waits shortly
 
 
 class Page(NamedTuple):
@@ -24,6 +25,26 @@ class Page(NamedTuple):
 
     size: int
     after: str | None
+
+
+class Batches:
+    """Collects samples for replies of many: one reply for each takes ten times as long."""
+
+    def __init__(self, send: Callable[[bytes], None]) -> None:
+        self._send, self._keys, self._values, self._size = send, list[str](), list[bytes](), 0
+
+    def add(self, key: str, value: bytes) -> None:
+        self._keys.append(key)
+        self._values.append(value)
+        self._size += len(key) + len(value)
+        if self._size >= _BATCH:
+            self.end()
+
+    def end(self) -> None:
+        if self._keys:
+            keys, values = orjson.dumps(self._keys), b",".join(self._values)
+            self._send(b'{"keys":%b,"values":[%b]}' % (keys, values))
+        self._keys, self._values, self._size = [], [], 0
 
 
 def is_paged(query: zenoh.Query) -> bool:

@@ -183,13 +183,17 @@ class Replies:
         until = self._clock() + (ANSWER_WITHIN if page is None else PAGE_WITHIN)
         last: Place = ("", 0, 0)
         count, again, lost, complete = 0, 0, None, False
+        is_own = str(query.key_expr) == self._keys.page
+        batches = pages.Batches(
+            lambda data: self._reply(query, self._keys.page_samples, data, self._stamp())
+        )
         for sample, place in found:
             if isinstance(sample, Damaged):
                 lost = sample
             elif isinstance(sample, bool):
                 complete = sample
             elif has_value(sample) or not only_good:
-                self._recorded(query, sample)
+                self._recorded(query, sample, batches if is_own else None)
                 count += 1
                 again += place is None
             last = place or last
@@ -198,17 +202,20 @@ class Replies:
             elif place is not None and (count >= page.size or self._clock() > until):
                 break
             pause()
+        batches.end()
         if page is not None:
             self._end_page(query, count, last, complete=complete, again=again, lost=lost)
         elif lost is not None:
             raise lost
 
-    def _recorded(self, query: zenoh.Query, sample: Sample) -> None:
-        key, stamp = self._keys.value(sample.tag.key), self._stamp()
-        if str(query.key_expr) == self._keys.page:  # a bare value does not say its type of then
-            self._reply(query, key, payload.value(sample), stamp)
+    def _recorded(
+        self, query: zenoh.Query, sample: Sample, batches: pages.Batches | None = None
+    ) -> None:
+        key = self._keys.value(sample.tag.key)
+        if batches is not None:  # as JSON: a bare value does not say its type of then
+            batches.add(key, payload.value(sample))
         else:
-            encoding.reply(query, key, sample, stamp)
+            encoding.reply(query, key, sample, self._stamp())
 
     def _go_on(self, until: float) -> None:
         if self._ended:
