@@ -153,6 +153,7 @@ class Gateway:
             "refused_why": "",
             "certificate_days": 300.0,
             "disk_days": None,
+            "group": None,
             "stand": None,
         }
 

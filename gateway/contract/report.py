@@ -37,5 +37,6 @@ def report(documents: Documents) -> ReportDocument:
         "refused_why": why[0][:MOST_TEXT] if why else "",
         "certificate_days": min((left for left in days if left is not None), default=None),
         "disk_days": disk_days(documents),
+        "group": documents.get("standby", {}).get("group"),
         "stand": documents.get("standby", {}).get("stand"),
     }

@@ -43,6 +43,7 @@ REPORT: dict[str, Any] = {
     "refused_why": "",
     "certificate_days": None,
     "disk_days": None,
+    "group": None,
     "stand": None,
 }
 NOON = 1795521600.0

@@ -28,7 +28,9 @@ def reports(**changed: dict[str, object]) -> Iterator[tuple[str, bytes, float]]:
 
 
 FAULT: dict[str, object] = {"fault": "mixer is silent", "faults": {"device-silent": 1}}
-THREE = partial(reports, good={}, sick=FAULT, old={"version": "1.1.0", "stand": "standby"})
+THREE = partial(
+    reports, good={}, sick=FAULT, old={"version": "1.1.0", "group": "hall", "stand": "standby"}
+)
 
 
 @pytest.fixture(autouse=True)
@@ -120,7 +122,7 @@ async def test_the_map_has_the_worst_first_and_words_and_states_find(tab: Tab) -
         assert "version 1.1.0 is old" in await tab.value(text("#fleet-list"))
         assert await tab.value(text("#fleet-faults")) == "Faults: device-silent 1"
         assert await tab.value(text("#fleet-versions")) == "Versions: 1.2.0 2 · 1.1.0 1"
-        assert await tab.value(text("#fleet-standby")) == "Standby groups: standby 1"
+        assert await tab.value(text("#fleet-standby")) == "Standby groups: hall: standby 1"
         await tab.click("#fleet-states .look")
         assert await tab.value(texts("#fleet-list .name")) == ["old"]
         await tab.click("#fleet-states .look")
@@ -136,7 +138,9 @@ async def test_what_is_old_says_so_and_names_are_text(
 ) -> None:
     evil = "<img src=x onerror=alert(1)>"
     async with serving(fleet=True) as client:
-        client.north.fleet = partial(reports, good={}, sick={**FAULT, "fault": evil, "stand": evil})
+        client.north.fleet = partial(
+            reports, good={}, sick={**FAULT, "fault": evil, "group": evil, "stand": evil}
+        )
         await tab.open(f"http://127.0.0.1:{client.port}/#fleet")
         await tab.until(f"{text('#fleet-list')}.includes({json.dumps(evil)})")
         assert await tab.value("document.querySelector('#view-fleet img')") is None

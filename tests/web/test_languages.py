@@ -227,7 +227,9 @@ def wrong() -> dict[str, Any]:
 def gateways() -> Iterator[tuple[str, bytes, float]]:
     """Reports of gateways: a good one, one with faults, an old one."""
     sick: dict[str, object] = {"fault": NO_BYTE, "faults": {"1": 2}}
-    return reports(one={}, two=sick, three={"version": "1.0.0", "stand": "standby"})
+    return reports(
+        one={}, two=sick, three={"version": "1.0.0", "group": "hall", "stand": "standby"}
+    )
 
 
 async def test_the_page_has_no_sentence_outside_its_catalogue(

@@ -14,7 +14,7 @@ class ReportDocument(TypedDict):
     `devices`: their number by standing. `load`: of its busiest line, measured. `faults`: the number
     of each kind, and `fault` is the first of them as a sentence. `digest` to `refused_why`: the
     configuration file. `certificate_days`: of the certificate that ends first. `disk_days`: until
-    the disk of history is full. `stand`: of a member of a standby group.
+    the disk of history is full. `group`, `stand`: of a member of a standby group.
     """
 
     contract: Number
@@ -38,6 +38,7 @@ class ReportDocument(TypedDict):
     refused_why: str
     certificate_days: float | None
     disk_days: float | None
+    group: str | None
     stand: str | None
 
 

@@ -75,7 +75,7 @@ function show() {
   style(byId("fleet-map"), all.length > 60 ? "small" : "");
   keyed(byId("fleet-map"), all, (one) => one.gateway, makeCell, (cell, one) => showCell(cell, one, chosen.has(one)));
   const busy = all.filter((one) => one.load > 0).sort((one, other) => other.load - one.load).slice(0, 3);
-  const stands = all.filter((one) => one.stand).map((one) => said(one.stand));
+  const stands = all.filter((one) => one.stand).map(stand);
   sum("fleet-faults", counted(all.flatMap((one) => Object.keys(one.faults ?? {}))), (list) => t("Faults: {list}", { list }));
   sum("fleet-versions", counted(all.filter((one) => one.version).map((one) => one.version)), (list) => t("Versions: {list}", { list }));
   sum("fleet-standby", counted(stands), (list) => t("Standby groups: {list}", { list }));
@@ -87,7 +87,8 @@ function show() {
 
 const sum = (id, pairs, shown) => put(id, pairs.length ? shown(pairs.map((pair) => pair.join(" ")).join(" · ")) : "");
 const says = (one) => one.says.replace(/\d{4}-\d\d-\d\dT[\d:]+Z/, (time) => moment(Date.parse(time))).split("; ").map(said).join("; ");
-const text = (one) => [one.gateway, says(one), one.version, one.stand, ...Object.keys(one.faults ?? {})].join(" ").toLowerCase();
+const stand = (one) => one.stand && `${one.group}: ${said(one.stand)}`;
+const text = (one) => [one.gateway, says(one), one.version, one.group, one.stand, ...Object.keys(one.faults ?? {})].join(" ").toLowerCase();
 
 function makeState(state) {
   return h("button", { type: "button", className: state, onclick: () => { only = only === state ? "" : state; show(); } });
@@ -127,7 +128,7 @@ function showRow(row, one) {
   put(row.name, short(one.gateway));
   put(row.says, says(one));
   const devices = Object.entries(one.devices ?? {}).map(([standing, number]) => `${number} ${said(standing)}`);
-  const facts = one.version && [t("version {version}", one), t("up {span}", { span: span(one.up) }), several(one.tags, "{n} tag", "{n} tags"), listed(devices), one.load !== null && t("load {n}", { n: `${Math.round(one.load * 100)} %` }), said(one.stand)];
+  const facts = one.version && [t("version {version}", one), t("up {span}", { span: span(one.up) }), several(one.tags, "{n} tag", "{n} tags"), listed(devices), one.load !== null && t("load {n}", { n: `${Math.round(one.load * 100)} %` }), stand(one)];
   put(row.facts, (facts || []).filter(Boolean).join(" · "));
 }
 
