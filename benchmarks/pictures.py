@@ -244,7 +244,7 @@ def many_gateways(number: int) -> Iterator[tuple[str, bytes, float]]:
         found = {**REPORT, "name": f"g{at}", "version": "1.0.0", "time": since, "tags": 300}
         found["load"] = (at * 37 % 90) / 100
         if at % 10 == 4:
-            found["stand"] = ("active", "standby")[at // 10 % 2]
+            found["group"], found["stand"] = "hall", ("active", "standby")[at // 10 % 2]
         if at % 23 == 7:
             found["faults"], found["devices"] = {"device-silent": 2}, {"up": 10, "silent": 2}
             found["fault"] = "mixer is silent: no byte came back: check power, wiring and station"

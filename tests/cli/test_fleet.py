@@ -173,7 +173,9 @@ def gateways(endpoint: str, *names: str) -> Iterator[None]:
         for name in names:
             key = f"works/@gateway/{name}/report"
             strange = {"revision": "=1+1", "version": "9" * 5000}  # of another program
-            payload = orjson.dumps(REPORT | {"name": name} | (strange if name == "c" else {}))
+            member = {"group": "hall", "stand": "waiting"}
+            more = {"b": member, "c": strange}.get(name, {})
+            payload = orjson.dumps(REPORT | {"name": name} | more)
             session.declare_queryable(key, partial(_reply, key, payload))
         yield
 
@@ -187,6 +189,7 @@ def test_the_command_as_a_table_json_and_csv(tmp_path: Path) -> None:
         done = plc_gateway(*asked)
         assert done.code == 0, done.err
         assert re.search(r"^works/a +\w+ +1\.2\.0 +1 min +3 +1 up +25% +d1", done.out, re.MULTILINE)
+        assert re.search(r"^works/b +\w+ \(hall: waiting\) +1\.2\.0", done.out, re.MULTILINE)
     with gateways(endpoint, "a"):
         done = plc_gateway(*asked, "--json", "--folder", tmp_path / "files")
         found = {one["gateway"]: one for one in map(json.loads, done.out.splitlines())}
