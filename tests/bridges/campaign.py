@@ -130,7 +130,8 @@ class Campaign:
             (self._influx if name == "server" else self._scada).kill()
         elif program := self._programs.pop(name, None):
             if program.running:
-                program.end(by)
+                if program.end(by) > 0:
+                    self.broken.append(f"{name} did not end well: {program.lines[-30:]}")
             else:
                 self.broken.append(f"{name} ended by itself: {program.lines[-30:]}")
 
