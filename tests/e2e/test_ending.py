@@ -2,8 +2,10 @@
 
 import asyncio
 import signal
+import socket
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -145,6 +147,23 @@ def test_a_client_without_its_router_ends_in_time(tmp_path: Path) -> None:
         assert program.end() == 0
         assert time.monotonic() - told < slowed(WITHIN)
         assert not program.has_said("Traceback")
+
+
+def test_a_client_of_mute_routers_ends_in_time(tmp_path: Path) -> None:
+    """They take connections and say nothing: each holds the thread that opens for seconds."""
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
+    with ExitStack() as mute:
+        routers = [mute.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)]
+        connect = [f"tcp/127.0.0.1:{router.getsockname()[1]}" for router in routers]
+        zenoh = {"mode": "client", "listen": [], "connect": connect}
+        path = write_config(tmp_path / "config.yaml", "", lines, zenoh=zenoh)
+        with gateway("run", path) as program:
+            program.says("device online")
+            mute.enter_context(routers[0].accept()[0])
+            told = time.monotonic()
+            assert program.end() == 0
+            assert time.monotonic() - told < slowed(WITHIN)
+            assert not program.has_said("Traceback")
 
 
 async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(

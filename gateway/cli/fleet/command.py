@@ -108,7 +108,7 @@ def _table(found: Sequence[Row]) -> Table:
         report = row.told.report
         load = "-" if report["load"] is None else f"{report['load']:.0%}"
         devices = ", ".join(f"{number} {word}" for word, number in report["devices"].items())
-        stand = f" ({report['group']}: {report['stand']})" if report["stand"] else ""
+        stand = f" ({report.get('group', '?')}: {report['stand']})" if report["stand"] else ""
         table.add_row(
             Text(printable(row.gateway)),
             Text.assemble(state, printable(stand)),

@@ -38,7 +38,7 @@ class ReportDocument(TypedDict):
     refused_why: str
     certificate_days: float | None
     disk_days: float | None
-    group: str | None
+    group: NotRequired[str | None]
     stand: str | None
 
 

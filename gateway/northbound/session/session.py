@@ -4,6 +4,7 @@ import asyncio
 import errno
 import json
 import os
+import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
@@ -38,6 +39,9 @@ async def open_session(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
         try:
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
+            if retry:  # a mute router takes seconds, and a client holds no port meanwhile
+                opening.add_done_callback(_close_unwanted)
+                raise
             with suppress(zenoh.ZError):
                 await off_loop((await opening).close)  # no caller is left to close it
             raise
@@ -50,6 +54,11 @@ async def open_session(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
             report("Zenoh router unreachable", error=_without_place(error))
         await asyncio.sleep(pause)
         pause = min(pause * 2, _LONGEST_RETRY)
+
+
+def _close_unwanted(opening: asyncio.Future[zenoh.Session]) -> None:
+    if not opening.cancelled() and opening.exception() is None:
+        threading.Thread(target=opening.result().close, daemon=True).start()
 
 
 def _without_place(error: zenoh.ZError) -> str:

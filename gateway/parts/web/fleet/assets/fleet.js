@@ -87,7 +87,7 @@ function show() {
 
 const sum = (id, pairs, shown) => put(id, pairs.length ? shown(pairs.map((pair) => pair.join(" ")).join(" · ")) : "");
 const says = (one) => one.says.replace(/\d{4}-\d\d-\d\dT[\d:]+Z/, (time) => moment(Date.parse(time))).split("; ").map(said).join("; ");
-const stand = (one) => one.stand && `${one.group}: ${said(one.stand)}`;
+const stand = (one) => one.stand && `${one.group ?? "?"}: ${said(one.stand)}`;
 const text = (one) => [one.gateway, says(one), one.version, one.group, one.stand, ...Object.keys(one.faults ?? {})].join(" ").toLowerCase();
 
 function makeState(state) {
