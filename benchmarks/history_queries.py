@@ -101,7 +101,9 @@ def read(endpoint: str) -> None:
 
 def _session(endpoint: str) -> zenoh.Session:
     """Opens a session that knows the gateway."""
-    session = zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,))))
+    config = configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))
+    config.insert_json5("connect/timeout_ms", "60000")
+    session = zenoh.open(config)
     with session.declare_querier("plant/**") as querier:
         while not querier.matching_status.matching:  # type: ignore[attr-defined]
             time.sleep(0.001)

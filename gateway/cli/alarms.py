@@ -141,7 +141,8 @@ def _acknowledge_all(
     orders = ((one["alarm"], fields | {"raised": one["raised"]}) for one in found)
     failed = [alarm for alarm, order in orders if _order(client, alarm, order, as_json=as_json)]
     if not as_json:
-        print(f"{len(found) - len(failed)} of {len(found)} alarms acknowledged")
+        done = f"{len(found) - len(failed)} of {len(found)} alarms acknowledged"
+        print(done if found else f"no alarm of '{pattern}' waits for acknowledgement")
     if failed:
         sys.exit(FAILED)
 

@@ -84,15 +84,16 @@ def line_down(
             why = next((text for words, text in _ALERTS.items() if words in said), "")
             return LineDown(f"{name}: {why or f'TLS fails: {said}'}")
         case OSError():
-            return LineDown(f"{name}: {_sentence(error, sentences or {})}")
+            return LineDown(f"{name}: {sentence_of(error, sentences)}")
         case _:
             return LineDown(f"{name}: {error or type(error).__name__}")
 
 
-def _sentence(error: OSError, sentences: Mapping[int, str]) -> str:
+def sentence_of(error: OSError, sentences: Mapping[int, str] | None = None) -> str:
+    """Returns the error as a sentence. `sentences` replaces those of some errnos."""
     number = error.errno
     # A host with several addresses fails with one text for all errors and without a number.
     if number is None and (found := _ERRNO.search(str(error))):
         number = int(found[1])
-    sentence = {**_SENTENCES, **sentences}.get(number or 0)
+    sentence = {**_SENTENCES, **(sentences or {})}.get(number or 0)
     return sentence or error.strerror or str(error) or type(error).__name__

@@ -336,4 +336,5 @@ async def test_from_an_unknown_line_to_twenty_tags_on_zenoh_in_a_browser(tmp_pat
         assert len(load(path).devices[0].tags) == 20
         await tab.until(f"{shown('#good')} === '20 of 20 values are good'")
         assert api.trial.said == "The file is as before."
+        await tab.until(f"{shown('#said')} === 'The file is as before.'")
         assert tab.errors == []

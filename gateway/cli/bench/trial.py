@@ -32,8 +32,8 @@ class Trial:
         release: Callable[[], Awaitable[object]] | None = None,
     ) -> None:
         """`release`: has the bench leave every port, before the gateway may open it."""
-        self.said = ""  # the last thing that happened, as a sentence
         self._draft = draft
+        self._said = "", ""  # a sentence, and the draft of then
         self._running = running
         self._within = within
         self._release = release
@@ -47,6 +47,15 @@ class Trial:
     def _before(self) -> Path:
         path = self._draft.path.resolve()
         return path.with_name(f"{path.name}.before")
+
+    @property
+    def said(self) -> str:
+        """The last thing that happened, as a sentence; empty after a later step of the draft."""
+        said, draft = self._said
+        return said if draft == self._draft.text else ""
+
+    def _say(self, said: str) -> None:
+        self._said = said, self._draft.text
 
     def left(self) -> float | None:
         """Returns the seconds until the file goes back; None: nothing waits; inf: it asks."""
@@ -76,9 +85,9 @@ class Trial:
                     await self._undo(is_first=is_first, ran=ran)
                 raise
             if is_first or not is_new:
-                self.said = "The gateway runs the file."
+                self._say("The gateway runs the file.")
                 return
-            self.said = "The gateway took the change over."
+            self._say("The gateway took the change over.")
             self._until = asyncio.get_running_loop().time() + self._within
             self._timer = asyncio.create_task(self._later(), name="trial")
 
@@ -89,7 +98,7 @@ class Trial:
             if self._until is not None:
                 await off_loop(_moved, self._before, backup_of(self._draft.path.resolve()))
                 self._until = None
-                self.said = "The change is kept."
+                self._say("The change is kept.")
 
     async def back(self, said: str = "The file is as before.") -> None:
         """Ends the trial: the file is as before, and the gateway takes it over."""
@@ -104,9 +113,9 @@ class Trial:
                     await self._release()
                 if self._running.state:
                     await self._running.take(await off_loop(load, self._draft.path))
-                self.said = said
+                self._say(said)
             except GatewayError as error:
-                self.said = f"The file could not go back: {error}"
+                self._say(f"The file could not go back: {error}")
 
     async def close(self) -> None:
         """Goes back if a person has not decided. A question of an earlier bench stays."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gateway.contract.access.secrets import readable_secret
 from gateway.errors import ConfigError, GatewayError
+from gateway.transport.os_errors import sentence_of
 
 
 def first_line(path: Path, way: str) -> str:
@@ -31,6 +32,7 @@ def said(error: Exception) -> str:
         said = reply.decode(errors="replace") if isinstance(reply, bytes) else reply
         text = f"the server answers {error.smtp_code} {said}"
     else:
-        text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
+        text = sentence_of(error) if isinstance(error, OSError) else str(error)
+        text = text or type(error).__name__
     text = " ".join(text.split())
     return "".join(c if c.isprintable() else "?" for c in text)[:200]

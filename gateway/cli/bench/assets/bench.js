@@ -37,7 +37,9 @@ byId("stations-form").addEventListener("submit", (event) => {
     await call("stations", { gateway: byId("gateway-name").value.trim(), line: byId("line-name").value.trim(), names });
     byId("stations-form").hidden = true;
     await look();
-    byId("look-form").requestSubmit();
+    const [first] = Object.values(names);
+    for (const list of ["device", "sheet-device"]) byId(list).value = first;
+    byId("device").onchange();
   });
 });
 
@@ -78,13 +80,13 @@ function showScan({ scan: found, ports, protocols, draft }) {
   options(byId("protocol"), protocols);
   byId("scanning").hidden = !found.runs;
   byId("share").value = found.share;
-  put("what", found.runs ? t("asking {what}", found) : "");
-  put("scan-said", [found.error, ...found.noises].filter(Boolean).join("\n"));
+  put("what", found.runs ? t("asking {what}", { what: said(found.what) }) : "");
+  put("scan-said", [found.error, ...found.noises].filter(Boolean).map(said).join("\n"));
   const key = found.runs || !found.found.length ? "" : `${found.port} ${found.found.map((one) => one.station)}`;
   if (key === named) return;
   named = key;
   byId("stations-form").hidden = !key;
-  put("found-title", t("Found at {at}, {port}:", found));
+  put("found-title", t("Found at {at}, {port}:", { ...found, at: said(found.at) }));
   byId("gateway-label").hidden = draft.exists || draft.devices.length > 0;
   keyed(byId("found"), found.found, (one) => one.station, station, () => {});
 }
@@ -97,8 +99,8 @@ function station(one) {
   return row;
 }
 
-function showDraft({ draft, settings, said, left, gateway }) {
-  put("size", draft.size || t("no tags yet"));
+function showDraft({ draft, settings, said: happened, left, gateway }) {
+  put("size", said(draft.size) || t("no tags yet"));
   byId("registers-card").hidden = byId("sheet-card").hidden = !draft.devices.length;
   showDevices(draft.devices);
   showSheetDevices(draft.devices, settings);
@@ -109,7 +111,7 @@ function showDraft({ draft, settings, said, left, gateway }) {
     put(before, Math.abs(was - one.load) > 0.0005 ? `${t("load of the wire")} ${percent(was)} →` : t("load of the wire"));
     put(load, percent(one.load));
     style(load, one.load > 1 ? "load bad" : "load");
-    put(advice, one.advice);
+    put(advice, said(one.advice));
   });
   keyed(byId("mistakes"), draft.mistakes, (one) => one, (one) => h("li", {}, one), () => {});
   const text = draft.difference.join("\n");
@@ -117,7 +119,7 @@ function showDraft({ draft, settings, said, left, gateway }) {
     byId("difference").shown = text;
     byId("difference").replaceChildren(...draft.difference.map((line) => h("span", { className: { "+": "plus", "-": "minus" }[line[0]] ?? "soft" }, line)), draft.more ? h("span", {}, t("and {n} more lines", { n: draft.more })) : "");
   }
-  put("said", draft.changed ? "" : said || (draft.exists ? t("The file has no change.") : ""));
+  put("said", said(happened) || (draft.changed || !draft.exists ? "" : t("The file has no change.")));
   put("apply", draft.changed || gateway.state ? t("Apply") : t("Run the gateway"));
   byId("apply").disabled = left !== null || draft.mistakes.length > 0 || !(draft.changed || (draft.exists && !gateway.state));
   byId("undo").disabled = !draft.steps;
