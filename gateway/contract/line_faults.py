@@ -21,7 +21,7 @@ Named = tuple[str, Document]
 
 
 class Fault(NamedTuple):
-    """What needs a person, or is to look at. Programs count by `code`, people read `text`.
+    """A fault or a warning. Programs count by `code`, people read `text`.
 
     `about`: the path of the status document that has its figures, such as `devices/mixer`.
     """

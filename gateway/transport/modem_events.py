@@ -21,7 +21,7 @@ class ModemSettings:
 
 @dataclass(slots=True)
 class Pins:
-    """What the signals of the port show."""
+    """The signals of the port."""
 
     dtr: bool = False  # the port has this signal
     carrier: bool = False  # the signal CD is alive, and says that the call is up

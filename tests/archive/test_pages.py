@@ -14,7 +14,7 @@ from gateway.archive.pages import History, Page, file_of
 from gateway.archive.rows import Row
 from gateway.archive.store import Cursor
 from gateway.errors import GatewayError
-from tests.zenoh_peer import configured, free_endpoint
+from tests.bridges.played import answered
 
 DEMO = "plant/@gateway/demo"
 SAMPLE = {"value": 1, "quality": "good", "time": "2026-11-26T12:00:00Z"}
@@ -51,18 +51,8 @@ def twice(query: zenoh.Query) -> None:
 
 
 async def asked(answer: Callable[[zenoh.Query], None]) -> Page:
-    endpoint = free_endpoint()
-    here = {"mode": "peer", "listen": [endpoint], "connect": [], "config": {}}
-    there = {"mode": "client", "listen": [], "connect": [endpoint], "config": {}}
-
-    def reply(query: zenoh.Query) -> None:
-        with query:
-            answer(query)
-
-    with zenoh.open(configured(here)) as gateway:
-        gateway.declare_queryable(f"{DEMO}/**", reply)
-        with await asyncio.to_thread(zenoh.open, configured(there)) as session:
-            return await History(session, DEMO).page("", 10)
+    async with answered(f"{DEMO}/**", answer) as session:
+        return await History(session, DEMO).page("", 10)
 
 
 @pytest.mark.parametrize(

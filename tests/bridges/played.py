@@ -1,13 +1,16 @@
 """A gateway as the bridges see it on Zenoh, played by a test."""
 
+import asyncio
 import json
 import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from typing import Any, Self
 
 import zenoh
 
-from tests.zenoh_peer import configured
+from tests.zenoh_peer import configured, free_endpoint
 
 META: dict[str, Any] = {
     "type": "int16",
@@ -25,6 +28,23 @@ def document(value: object, reason: str = "") -> dict[str, Any]:
     if reason:
         return {"value": None, "quality": "bad", "reason": reason, "time": time}
     return {"value": value, "quality": "good", "time": time}
+
+
+@asynccontextmanager
+async def answered(key: str, answer: Callable[[zenoh.Query], None]) -> AsyncIterator[zenoh.Session]:
+    """A session, beside a program that answers every query of these keys."""
+    endpoint = free_endpoint()
+    here = {"mode": "peer", "listen": [endpoint], "connect": [], "config": {}}
+    there = {"mode": "client", "listen": [], "connect": [endpoint], "config": {}}
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            answer(query)
+
+    with zenoh.open(configured(here)) as other:
+        other.declare_queryable(key, reply)
+        with await asyncio.to_thread(zenoh.open, configured(there)) as session:
+            yield session
 
 
 class PlayedGateway:

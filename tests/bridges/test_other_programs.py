@@ -1,6 +1,5 @@
 """Answers of another program in place of a gateway: they end no bridge, and prove nothing."""
 
-import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -15,8 +14,7 @@ from gateway.bridges.documents import MOST_ELEMENTS, described_by
 from gateway.bridges.opcua.history import History
 from gateway.bridges.remote_plant import RemotePlant
 from gateway.errors import GatewayError
-from tests.bridges.played import META
-from tests.zenoh_peer import configured, free_endpoint
+from tests.bridges.played import META, answered
 
 SPEED = ua.NodeId("mixer/speed", 2)
 
@@ -24,20 +22,10 @@ SPEED = ua.NodeId("mixer/speed", 2)
 @asynccontextmanager
 async def plant(answer: Callable[[zenoh.Query], None]) -> AsyncIterator[RemotePlant]:
     """A plant with the tag `mixer/speed`, where every query has this answer."""
-    endpoint = free_endpoint()
-    here = {"mode": "peer", "listen": [endpoint], "connect": [], "config": {}}
-    there = {"mode": "client", "listen": [], "connect": [endpoint], "config": {}}
-
-    def reply(query: zenoh.Query) -> None:
-        with query:
-            answer(query)
-
-    with zenoh.open(configured(here)) as other:
-        other.declare_queryable("plant/**", reply)
-        with await asyncio.to_thread(zenoh.open, configured(there)) as session:
-            found = RemotePlant(session, "plant", lambda *_: None, lambda *_: None)
-            found.tags["mixer/speed"] = META
-            yield found
+    async with answered("plant/**", answer) as session:
+        found = RemotePlant(session, "plant", lambda *_: None, lambda *_: None)
+        found.tags["mixer/speed"] = META
+        yield found
 
 
 def refuses(payload: str) -> Callable[[zenoh.Query], None]:
