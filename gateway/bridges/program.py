@@ -66,11 +66,11 @@ async def opened(gateways: Gateways) -> zenoh.Session:
             config = zenoh.Config()
             config.insert_json5("connect/endpoints", json.dumps(list(gateways.connect)))
             config.insert_json5("scouting/multicast/enabled", "false")
+            config.insert_json5("transport/unicast/open_timeout", "5000")  # satellites need 3 s
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
-        # Each endpoint once: with a time for all Zenoh waits at the first. Satellites need 3 s.
+        # Each endpoint once: with a time for all Zenoh waits at the first.
         config.insert_json5("connect/timeout_ms", "0")
-        config.insert_json5("transport/unicast/open_timeout", "5000")
     except zenoh.ZError as error:
         raise ConfigError(f"{gateways.file or ', '.join(gateways.connect)}: {error}") from None
     while True:

@@ -177,7 +177,7 @@ class AlarmCounts(TypedDict):
 
 
 class FaultDocument(TypedDict):
-    """What needs a person. Programs count by `code`."""
+    """A trouble that needs a person. Programs count by `code`."""
 
     code: str
     text: str

@@ -1,4 +1,4 @@
-"""What one rule has to say: a comparison of the open alarms with those that it has sent.
+"""The notices of one rule: a comparison of the open alarms with those that it has sent.
 
 It does no I/O and has no clock. It goes by the state of the alarms, not by their events: what
 happened while the gateway was off, or a message waited, is said as it is now.
@@ -19,7 +19,7 @@ _UNACKNOWLEDGED, _IN_ALARM = ("active", "returned"), ("active", "acknowledged")
 
 
 class What(StrEnum):
-    """What a message says of an alarm."""
+    """The event of an alarm in a message."""
 
     RAISED = "raised"
     WAITS = "not acknowledged"  # for as long as `after` of the rule

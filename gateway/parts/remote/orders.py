@@ -1,4 +1,4 @@
-"""What a writer may order: another file, its confirmation, and the way back."""
+"""The orders of a writer: another file, its confirmation, and the way back."""
 
 from enum import StrEnum
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""What the page shows of the past of the lines: their loads, and a timeline of their states."""
+"""The past of the lines for the page: their loads, and a timeline of their states."""
 
 import asyncio
 import re

@@ -39,7 +39,7 @@ class WebSection(Section):
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
     origins: list[WebOrigin] = []
-    """Where pages of an HMI come from that may use the gateway, such as https://hmi.plant."""
+    """The origin of pages of an HMI that may use the gateway, such as https://hmi.plant."""
 
     @property
     def host(self) -> str:
