@@ -183,6 +183,7 @@ def test_a_file_in_the_pages_loads(block: Block, tmp_path: Path) -> None:
         (tmp_path / name).write_text("Name,Address\nspeed,D100\n")  # sheets of tags
     for name in re.findall(r"[\w.-]+\.(?:pem|key)\b", block.text):
         (tmp_path / name).touch()
+    (tmp_path / "files").mkdir()  # of a fleet
     assert loaded(block.text, tmp_path).devices
 
 

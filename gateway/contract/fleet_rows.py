@@ -4,16 +4,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
-from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from gateway.config import ConfigErrors, load
 from gateway.contract.documents.fleet import ReportDocument
 from gateway.contract.faults import DAYS_LEFT, DAYS_OF_DISK
+from gateway.contract.fleet_files import Wanted
 
 LARGEST_OFFSET = 5.0  # seconds between a clock and that of this computer
-MOST_FILES = 10_000
 _REPORT = TypeAdapter(ReportDocument)
 
 
@@ -24,14 +22,6 @@ class State(IntEnum):
     FAULT = 1
     LOOK = 2
     GOOD = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """A gateway as a file wants it."""
-
-    file: Path
-    digest: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,30 +57,6 @@ class Row:
         }
 
 
-def wanted_in(folder: Path) -> tuple[dict[str, Wanted], list[str]]:
-    """Returns the gateways of the files in a folder and below, and the mistakes in them.
-
-    Templates and files of other programs have no `lines`, and are left out.
-    """
-    found, mistakes = dict[str, Wanted](), list[str]()
-    files = sorted(file for tail in ("*.yaml", "*.yml") for file in folder.rglob(tail))
-    for file in files[:MOST_FILES]:
-        try:
-            config = load(file, elsewhere=True)
-        except ConfigErrors as error:
-            mistakes.append(str(error).splitlines()[0])
-            continue
-        gateway = f"{config.zenoh.prefix}/{config.name}"
-        if gateway in found:
-            other = found[gateway].file
-            mistakes.append(f"{file}: {gateway} is the gateway of {other} too: only one can run")
-            continue
-        found[gateway] = Wanted(file, config.digest)
-    if len(files) > MOST_FILES:
-        mistakes.append(f"{folder} has {len(files)} files: only {MOST_FILES} were read")
-    return found, mistakes
-
-
 def rows(
     told: Mapping[str, Told], wanted: Mapping[str, Wanted] | None, seen: Mapping[str, str]
 ) -> list[Row]:
@@ -117,8 +83,8 @@ def _row(
         return Row(gateway, State.MISSING, None, "", when)
     if told.report["fault"]:
         more = sum(told.report["faults"].values()) - 1
-        says = f"{told.report['fault']}{f', and {more} more' if more else ''}"
-        return Row(gateway, State.FAULT, told, drift, says)
+        fault = f"{told.report['fault']}{f', and {more} more' if more else ''}"
+        return Row(gateway, State.FAULT, told, drift, "; ".join([fault, *_differs(drift)]))
     says = "; ".join(_to_look_at(told, drift, newest))
     return Row(gateway, State.LOOK if says else State.GOOD, told, drift, says)
 
@@ -129,12 +95,16 @@ def _drift(report: ReportDocument, wanted: Wanted | None) -> str:
     return "" if wanted.digest == report["digest"] else f"differs from {wanted.file.name}"
 
 
+def _differs(drift: str) -> Iterator[str]:
+    if drift:
+        yield "no file of the folder is its own" if drift == "no file" else f"its file {drift}"
+
+
 def _to_look_at(told: Told, drift: str, newest: tuple[int, ...]) -> Iterator[str]:
     report = told.report
     if report["refused"]:
         yield f"its changed file was refused: {report['refused_why']}"
-    if drift:
-        yield "no file of the folder is its own" if drift == "no file" else f"its file {drift}"
+    yield from _differs(drift)
     if abs(told.offset) > LARGEST_OFFSET:
         yield f"its clock is {told.offset:+.0f} s off"
     if (days := report["certificate_days"]) is not None and days < DAYS_LEFT:

@@ -1,6 +1,7 @@
 """The command `fleet`, and the reports that it shows."""
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,8 @@ import zenoh
 from gateway.config import load
 from gateway.config.loading import dumped
 from gateway.contract.documents.fleet import ReportDocument
-from gateway.contract.fleet_rows import State, Told, Wanted, rows, told_by, wanted_in
+from gateway.contract.fleet_files import Wanted, wanted_in
+from gateway.contract.fleet_rows import State, Told, rows, told_by
 from tests.cli.conftest import Command
 from tests.e2e.processes import free_port, plc_gateway, started, until, write_config
 from tests.northbound.access import PASSWORDS, ROUTER_RULES, rules, users
@@ -137,8 +139,18 @@ def test_a_folder_of_files(tmp_path: Path) -> None:
     (tmp_path / "north" / "b.yaml").write_text("# the second\n" + dumped(other))
     (tmp_path / "same.yaml").write_text(dumped(other))
     (tmp_path / "wrong.yaml").write_text("lines: [")
+    for other_program in ("pumps.yaml", ".git/config.yaml"):
+        (tmp_path / other_program).parent.mkdir(exist_ok=True)
+        (tmp_path / other_program).write_text("templates: {pump: {tags: {}}}")
+    (tmp_path / "empty.yaml").touch()
+    (tmp_path / "loop.yaml").symlink_to("loop.yaml")
+    (tmp_path / "north" / "up").symlink_to("..")
+    os.mkfifo(tmp_path / "pipe.yml")
     found, mistakes = wanted_in(tmp_path)
     assert found.keys() == {"works/a", "works/b"}
+    assert len(mistakes) == 5
+    for name in ("empty.yaml", "loop.yaml", "pipe.yml"):
+        assert any(name in one for one in mistakes), name
     assert any("wrong.yaml" in one for one in mistakes)
     assert any("works/b is the gateway of" in one for one in mistakes)
     digests = {load(tmp_path / name).digest for name in ("north/b.yaml", "same.yaml")}

@@ -85,7 +85,8 @@ class PlainPlant:
 
     @property
     def config(self) -> Any:
-        return SimpleNamespace(part=lambda _kind: AlarmsSection())
+        zenoh = ZenohConfig(prefix="works")
+        return SimpleNamespace(part=lambda _kind: AlarmsSection(), zenoh=zenoh)
 
     def wire_logs(self) -> Mapping[str, WireLog]:
         return {"hall": self.hall}

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from gateway.config import load
+from gateway.config.loading import dumped
 from gateway.errors import GatewayError
 from gateway.parts.web.fleet import api
-from tests.cli.test_fleet import REPORT
+from tests.cli.test_fleet import FILE, REPORT
 from tests.conftest import needs
 from tests.web.browser import Tab, browser
 from tests.web.serving import Client, serving
@@ -76,6 +78,42 @@ async def test_damaged_reports_are_mistakes_and_hide_no_other() -> None:
         found = (await client.ask("/api/fleet")).json
         assert len(found["gateways"]) == 3
         assert found["mistakes"][0].startswith("works/bad: its report cannot be read")
+
+
+async def test_the_files_of_a_folder_are_compared_and_read_again_after_a_change(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "good.yaml"
+    north = FILE | {"zenoh": {"prefix": "works/north"}}
+    file.write_text(dumped(north | {"gateway": {"name": "good"}}))
+    (tmp_path / "gone.yaml").write_text(dumped(FILE | {"gateway": {"name": "gone"}}))
+    (tmp_path / "other.yaml").write_text(dumped(FILE | {"zenoh": {"prefix": "elsewhere"}}))
+
+    async def compared(client: Client) -> dict[str, str]:
+        found = (await client.ask("/api/fleet")).json
+        while found["mistakes"]:  # a slow machine: the next answer has them
+            assert "are being read" in found["mistakes"][0]
+            found = (await client.ask("/api/fleet")).json
+        return {one["gateway"]: one["says"] for one in found["gateways"]}
+
+    async with serving(fleet=tmp_path) as client:
+        sick = {**FAULT, "digest": "other"}
+        client.north.fleet = partial(reports, good={"digest": load(file).digest}, sick=sick)
+        assert await compared(client) == {
+            "works/gone": "it never replied",
+            "works/north/sick": "mixer is silent; no file of the folder is its own",
+            "works/north/good": "",
+        }
+        file.write_text(file.read_text().replace("D0", "D1"))
+        assert (await compared(client))["works/north/good"] == "its file differs from good.yaml"
+
+
+async def test_a_folder_that_cannot_be_read_hides_no_gateway(tmp_path: Path) -> None:
+    async with serving(fleet=tmp_path / "gone") as client:
+        client.north.fleet = THREE
+        found = (await client.ask("/api/fleet")).json
+        assert len(found["gateways"]) == 3
+        assert "No such file" in found["mistakes"][0]
 
 
 async def test_many_clients_ask_the_gateways_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,8 @@ from gateway.cli.fleet.rollout import DONE, KEY, Ended, Pace, Result, Rollout, S
 from gateway.cli.terminal import FAILED, AsJson, ZenohFile, err, out, printable
 from gateway.config.settings.parsers import interval
 from gateway.contract.documents.fleet import RemoteDocument
-from gateway.contract.fleet_rows import Told, Wanted, gateway_of, told_by
+from gateway.contract.fleet_files import Wanted
+from gateway.contract.fleet_rows import Told, gateway_of, told_by
 from gateway.contract.line_faults import span
 from gateway.errors import ConfigError, GatewayError
 

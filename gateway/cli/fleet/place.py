@@ -12,7 +12,7 @@ from gateway.cli.client import Client, connected
 from gateway.cli.terminal import ROUTER, err
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.gateway_address import GatewayAddress
-from gateway.contract.fleet_rows import Wanted, wanted_in
+from gateway.contract.fleet_files import Wanted, wanted_in
 from gateway.errors import ConfigError
 
 Connect = Annotated[

@@ -58,11 +58,12 @@ class Server:
             *files_of(ASSETS, "page.html"),
             catalogue_route("page", config.language),
         ]
-        if config.fleet:
+        if config.fleet is not False:
             page = with_fleet((ASSETS / "page.html").read_bytes())
             routes = [one for one in routes if one.path != "/"]
             routes += [file_route("/", page, "text/html"), *files_of(fleet.ASSETS, "")]
-            routes += FleetApi(core).routes()
+            folder = config.fleet if isinstance(config.fleet, Path) else None
+            routes += FleetApi(core, folder).routes()
         self.description = openapi.document(routes)
         text = json.dumps(self.description, indent=2).encode()
         routes.append(file_route("/openapi.json", text, "application/json"))

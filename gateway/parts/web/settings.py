@@ -34,8 +34,8 @@ class WebSection(Section):
     alarm, a history or a unit."""
     language: Language | None = None
     """The language of the page, unless a person chooses another; left out: that of the browser."""
-    fleet: bool = False
-    """Show all gateways under the prefix too: docs/fleet.md."""
+    fleet: bool | FilePath = False
+    """Show all gateways under the prefix too; a folder: beside their files. See docs/fleet.md."""
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
     origins: list[WebOrigin] = []
@@ -77,6 +77,12 @@ def _place(settings: WebSection | None, place: Place) -> WebSection | None:
     if (tls := settings.tls) is not None:
         found = {name: place.existing(file, "web", "tls", name) for name, file in dict(tls).items()}
         files["tls"] = tls.model_copy(update=found)
+    if isinstance(settings.fleet, Path):
+        files["fleet"] = place.folder / settings.fleet
+        if not (place.mistakes.elsewhere or files["fleet"].is_dir()):
+            place.mistakes.add(
+                ("web", "fleet"), f"{files['fleet']} is no folder: write true for none"
+            )
     return settings.model_copy(update=files)
 
 

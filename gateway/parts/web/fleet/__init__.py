@@ -1,1 +1,1 @@
-"""All gateways under the prefix, on the page of one of them: `web: {fleet: true}`."""
+"""All gateways under the prefix, on the page of one of them: `web: {fleet: files}`."""

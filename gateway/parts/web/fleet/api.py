@@ -10,6 +10,7 @@ from aiohttp import web
 from gateway.contract import payload
 from gateway.contract.fleet_rows import rows, told_by
 from gateway.errors import GatewayError
+from gateway.parts.web.fleet.files import FleetFiles
 from gateway.parts.web.routes import Route, answer, raw
 from gateway.parts.web.schemas import ref
 from gateway.plant.part import Core
@@ -26,10 +27,12 @@ _OURS = (
 
 
 class FleetApi:
-    """The handler. One query at a time. Keeps who replied until the gateway ends."""
+    """The handler. One query at a time. Keeps who replied until the gateway ends. `folder`: the
+    files of the gateways, or None."""
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: Core, folder: Path | None) -> None:
         self._north = core.north
+        self._files = None if folder is None else FleetFiles(folder, core.config.zenoh.prefix)
         self._seen: dict[str, str] = {}
         self._asking = asyncio.Lock()
         self._asked_at = float("-inf")
@@ -51,6 +54,8 @@ class FleetApi:
         try:
             async with self._asking:
                 if loop.time() - self._asked_at >= ASK_EVERY:
+                    if self._files is not None:
+                        await self._files.look()
                     self._found = await off_loop(self._ask)
                     self._asked_at = loop.time()
         except GatewayError as error:
@@ -68,11 +73,12 @@ class FleetApi:
         self._seen |= {name: one.report["time"] for name, one in told.items()}
         for name in [*self._seen][:-MOST_GATEWAYS]:
             del self._seen[name]
+        wanted, more = (None, ()) if self._files is None else self._files.found
         document = {
             "time": rfc3339(int(asked * 1e9)),
             "took": round(time.time() - asked, 3),
-            "gateways": [row.document() for row in rows(told, None, self._seen)],
-            "mistakes": mistakes[:100],
+            "gateways": [row.document() for row in rows(told, wanted, self._seen)],
+            "mistakes": [*mistakes, *more][:100],
         }
         return gzip.compress(payload.document(document), 1)
 

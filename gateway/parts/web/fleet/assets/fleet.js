@@ -25,7 +25,7 @@ byId("main").append(
       h("input", { id: "fleet-find", type: "search", placeholder: t("Name, fault, version"), "aria-label": t("Find gateways"), autocomplete: "off", oninput: show })),
     h("ul", { id: "fleet-map", "aria-label": t("Map of the gateways") }),
     h("div", { id: "fleet-sums" },
-      ...["faults", "versions", "standby", "load"].map((name) => h("p", { id: `fleet-${name}`, className: "soft" }))),
+      ...["faults", "versions", "drift", "standby", "load"].map((name) => h("p", { id: `fleet-${name}`, className: "soft" }))),
     h("ul", { id: "fleet-list", className: "rows", "aria-label": t("Gateways") }),
     h("p", { id: "fleet-more", className: "soft" })),
 );
@@ -78,6 +78,7 @@ function show() {
   const stands = all.filter((one) => one.stand).map(stand);
   sum("fleet-faults", counted(all.flatMap((one) => Object.keys(one.faults ?? {}))), (list) => t("Faults: {list}", { list }));
   sum("fleet-versions", counted(all.filter((one) => one.version).map((one) => one.version)), (list) => t("Versions: {list}", { list }));
+  sum("fleet-drift", counted(all.filter((one) => one.drift).map((one) => one.drift === "no file" ? t("no file") : t("differs"))), (list) => t("Files: {list}", { list }));
   sum("fleet-standby", counted(stands), (list) => t("Standby groups: {list}", { list }));
   sum("fleet-load", busy.map((one) => [short(one.gateway), `${Math.round(one.load * 100)} %`]), (list) => t("Busiest: {list}", { list }));
   keyed(byId("fleet-list"), found.slice(0, MOST_ROWS), (one) => one.gateway, makeRow, showRow);
