@@ -566,7 +566,7 @@ def _example_keys() -> set[str]:
     devices = [device.name for device in config.devices]
     return {
         *(key for tag in tags for key in (keys.value(tag), keys.set(tag), keys.meta(tag))),
-        *(key for n in devices for key in (keys.device(n), keys.block(n), keys.peek(n))),
+        *(key for n in devices for key in (keys.device(n), keys.block(n), keys.command(n, "peek"))),
         *map(keys.set, devices),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
@@ -580,8 +580,8 @@ def _example_keys() -> set[str]:
             keys.status("status"),
             keys.status("transfers/1"),
             keys.writes,
-            keys.page,
-            keys.page_samples,
+            keys.status("page"),
+            keys.status("page/samples"),
         ),
         *(
             keys.command(name, command)

@@ -107,34 +107,9 @@ class Keys:
         return f"{self.prefix}/**/@adv/**"
 
     @property
-    def metas(self) -> str:
-        return f"{self.prefix}/**/@meta"
-
-    @property
-    def sets(self) -> str:
-        """Every write to any gateway under the prefix."""
-        return f"{self.prefix}/**/@set"
-
-    def commands(self, command: str) -> str:
-        """One command to any device of any gateway under the prefix."""
-        return f"{self.prefix}/*/@{command}"
-
-    def peek(self, device: str) -> str:
-        """A read of any addresses of a device; `*`: of any gateway under the prefix."""
-        return f"{self.prefix}/{device}/@peek"
-
-    @property
-    def blocks(self) -> str:
-        return f"{self.prefix}/*/@block"
-
-    @property
     def own(self) -> str:
         """The liveliness token of the gateway; its status and writes lie below."""
         return f"{self.prefix}/@gateway/{self.gateway}"
-
-    @property
-    def statuses(self) -> str:
-        return f"{self.own}/**"
 
     def everywhere(self, path: str) -> str:
         """A document of all gateways under the prefix, and under prefixes below it."""
@@ -155,16 +130,6 @@ class Keys:
         """The outcome of every write."""
         return f"{self.own}/writes"
 
-    @property
-    def page(self) -> str:
-        """The last reply to a query with `page`."""
-        return f"{self.own}/page"
-
-    @property
-    def page_samples(self) -> str:
-        """The samples of a page that was queried on `page`."""
-        return f"{self.own}/page/samples"
-
     def group(self, group: str) -> str:
         """The liveliness tokens of one standby group lie below."""
         return f"{self.prefix}/@standby/{group}"
@@ -179,7 +144,7 @@ class Keys:
         return f"{self.own}/claim/{session}"
 
     def status(self, path: str) -> str:
-        """`status`, `lines/<line>` or `devices/<device>` of this gateway."""
+        """`status`, `lines/<line>` or `devices/<device>` of this gateway; `**`: all of them."""
         return f"{self.own}/{path}"
 
     def device(self, device: str) -> str:
@@ -200,13 +165,14 @@ class Keys:
         return value_key[len(stem) :] if value_key.startswith(stem) else None
 
     def set(self, tag: str) -> str:
+        """The writes to a tag, or to a device; `**`: all under the prefix."""
         return f"{self.prefix}/{tag}/@set"
 
     def meta(self, tag: str) -> str:
         return f"{self.prefix}/{tag}/@meta"
 
     def command(self, device: str, command: str) -> str:
-        """A command to one device: run, stop ..."""
+        """A command to one device: run, stop, peek ...; `*`: to all under the prefix."""
         return f"{self.prefix}/{device}/@{command}"
 
     def to_all(self, line: str) -> str:

@@ -13,7 +13,7 @@ import zenoh
 from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.contract.access import secrets
 from gateway.contract.access.writers import Writers
-from gateway.contract.interfaces import Device, Parts, Plant
+from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import GroupResult
 from gateway.contract.problems import Failure
@@ -103,7 +103,7 @@ class Northbound:
         self._plant = plant
         self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
         index = TagIndex(self.keys, plant.devices())
-        self._admission = Admission(group, self.keys, self._config, index.names, plant.duty)
+        self.admission = Admission(group, self.keys, self._config, index.names, plant.duty)
         losses = SlowPuts(drop_limit(self._config))
         self._publisher = Publisher(losses, index)
         self._batches = ScanBatches(self._publisher, index)
@@ -186,42 +186,6 @@ class Northbound:
         """True when the gateway serves its plant."""
         return self.opened.is_set()
 
-    @property
-    def active(self) -> asyncio.Event:
-        return self._admission.active
-
-    @property
-    def replaced(self) -> asyncio.Event:
-        return self._admission.replaced
-
-    @property
-    def namesake(self) -> bool:
-        """True if another gateway with this name serves already: this one must end."""
-        return self._admission.claiming.namesake
-
-    @property
-    def withheld(self) -> Mapping[str, str]:
-        """Devices of the file that other gateways serve, with the names of those gateways."""
-        return self._admission.claiming.withheld
-
-    def withhold(self, devices: Mapping[str, str]) -> None:
-        """Notes devices of the file that are not in the plant. Call it before `run`."""
-        self._admission.claiming.withhold(devices)
-
-    # -- a changed file --
-
-    def index(self, devices: Iterable[Device]) -> TagIndex:
-        """Returns the keys of other devices, for `change`. Any thread may call it."""
-        return TagIndex(self.keys, devices)
-
-    def taken(self, devices: Iterable[str]) -> Mapping[str, str]:
-        """Returns those of other devices that other gateways serve, with their names."""
-        return self._admission.claiming.taken(devices)
-
-    async def claim(self, devices: Iterable[str]) -> None:
-        """Claims these devices, and no others any more."""
-        await self._admission.claiming.change(devices)
-
     async def change(self, index: TagIndex) -> None:
         """Serves the devices of the plant as they are now."""
         self._publisher.forget(self._incoming.become(index))
@@ -247,7 +211,7 @@ class Northbound:
         is_client = self._config.get_json("mode") == f'"{ZenohMode.CLIENT.value}"'
         if is_client:
             self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
-        alone = asyncio.create_task(self._admission.run_alone())
+        alone = asyncio.create_task(self.admission.run_alone())
         try:
             session = await open_session(self._config, retry=is_client)
         finally:
@@ -264,8 +228,8 @@ class Northbound:
                 raise
 
     async def _serve_watched(self, session: zenoh.Session) -> None:
-        replaced = self.replaced.set
-        watchdog = Watchdog(lambda: [session, *self._admission.sessions()], replaced)
+        replaced = self.admission.replaced.set
+        watchdog = Watchdog(lambda: [session, *self.admission.sessions()], replaced)
         with watchdog.watching():
             try:
                 await self._serve(session)
@@ -281,10 +245,10 @@ class Northbound:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._watch_publisher())
             self._declared = await off_loop(self._declare_first, session, declarations, links)
-            tasks.create_task(self._admission.run(session))
+            tasks.create_task(self.admission.run(session))
             tasks.create_task(self._status.run())
             tasks.create_task(self._after_lost_routers())
-            await self._admission.active.wait()
+            await self.admission.active.wait()
             self._plant.begin()
             self._incoming.begin()
             await off_loop(self._declare_plant, declarations)
@@ -296,7 +260,7 @@ class Northbound:
             await off_loop(self._incoming.changed)  # a reload came between
             log.info("Zenoh session ready", prefix=self.keys.prefix, id=str(session.zid()))
             tasks.create_task(self._republisher.run())
-            tasks.create_task(self._admission.claiming.notice_answers(session, self._some_key))
+            tasks.create_task(self.admission.claiming.notice_answers(session, self._some_key))
 
     def _some_key(self) -> str | None:
         """Returns the key of a value of this gateway; None: it has none."""
@@ -320,14 +284,14 @@ class Northbound:
         """Declares everything that a standby gateway serves too."""
         declared = [*self._links.declare(session, links)]
         declarations.status()
-        if self._admission.standby.enabled:
+        if self.admission.standby.enabled:
             declarations.token()
         return declared
 
     def _declare_plant(self, declarations: Declarations) -> None:
         """The token comes last: a client that sees it may query at once."""
         declarations.plant()
-        if not self._admission.standby.enabled:
+        if not self.admission.standby.enabled:
             declarations.token()
 
     async def _close(self, session: zenoh.Session) -> None:
@@ -355,7 +319,7 @@ class Northbound:
 
     def _collect_status(self) -> Mapping[str, Mapping[str, object]]:
         documents = dict(self._plant.status())
-        documents["status"] = {**documents["status"], **self._admission.claiming.status()}
+        documents["status"] = {**documents["status"], **self.admission.claiming.status()}
         links = {"to": self._links.kinds(), "connect": endpoints(self._config, "connect")}
         most = {"superseded_most": self._publisher.most_superseded()}
         zenoh_document = {**self.counters(), **most, **links}
@@ -366,7 +330,7 @@ class Northbound:
             for tag in [*device.tags][:1]
             if (word := tag.origin.not_real) is not None
         }
-        found = {**documents, **own, **self._admission.documents(origins)}
+        found = {**documents, **own, **self.admission.documents(origins)}
         return {**found, "report": report(found)}
 
 

@@ -118,7 +118,8 @@ async def _serve(
         files=Files(config.writers_file, config.writers_state, config.folder),
         group=group_settings(config),
     )
-    northbound.withhold(withheld)
+    admission = northbound.admission
+    admission.claiming.withhold(withheld)
     plant.subscribe(northbound)
     plant.subscribe(parts)  # clients may have missed what was published
     plant.doors.documents.append(lambda: {"clock": clock.document(), "reload": reloader.document()})
@@ -142,9 +143,9 @@ async def _serve(
             asyncio.create_task(event.wait())
             for event in (
                 northbound.exclusive,
-                northbound.active,
+                admission.active,
                 northbound.opened,
-                northbound.replaced,
+                admission.replaced,
                 stop,
                 running.failed,
                 outdated,
@@ -178,13 +179,13 @@ async def _serve(
         if opened.done():
             started()
         await _first(*ends)
-    if northbound.namesake:
+    if admission.claiming.namesake:
         raise GatewayError(
             f"another gateway named {config.name} serves under {config.zenoh.prefix} already: "
             "`gateway.name` must differ, and a file runs once"
         )
-    again = northbound.replaced.is_set() or outdated.is_set()
-    return northbound.withheld if again and not stop.is_set() else None
+    again = admission.replaced.is_set() or outdated.is_set()
+    return admission.claiming.withheld if again and not stop.is_set() else None
 
 
 async def _first(*tasks: asyncio.Task[Any]) -> None:

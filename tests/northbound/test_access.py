@@ -44,8 +44,8 @@ async def test_behind_a_router_a_second_gateway_leaves_the_devices_to_the_first(
         second = northbound_of(mixer(), settings, name="second")
         serves = asyncio.create_task(second.run())
         async with asyncio.timeout(300):
-            await second.replaced.wait()
-        assert second.withheld == {"mixer": "demo", "oven": "demo"}
-        assert not second.active.is_set()
+            await second.admission.replaced.wait()
+        assert second.admission.claiming.withheld == {"mixer": "demo", "oven": "demo"}
+        assert not second.admission.active.is_set()
         serves.cancel()
         await asyncio.wait([serves])

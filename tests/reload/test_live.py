@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from gateway.config import load
@@ -14,19 +15,16 @@ from tests.reload.plant import Data, file, vigor
 from tests.sim.virtual import on_virtual_time
 
 
-class North:
-    """The Zenoh side of a gateway whose neighbour serves one device."""
+class Claiming:
+    """The claims of a gateway whose neighbour serves one device."""
 
     withheld: Mapping[str, str] = {}
 
     def taken(self, devices: Iterable[str]) -> Mapping[str, str]:
         return {"press": "other"} if "press" in devices else {}
 
-    async def claim(self, devices: Iterable[str]) -> None:
+    async def change(self, devices: Iterable[str]) -> None:
         raise AssertionError("nothing may be claimed")
-
-    def index(self, devices: object) -> None:
-        """No keys."""
 
 
 def write(path: Path, **devices: Data) -> Path:
@@ -39,9 +37,9 @@ async def test_a_device_of_another_gateway_is_refused_and_nothing_changes(tmp_pa
     path = write(tmp_path / "c.yaml", mixer=vigor(1))
     gateway = Plant(load(path))
     before = gateway.config
-    reloader, lines, north = Reloader(path, before), RunningLines(), North()
-    any_north: Any = north
-    live = LiveReload(reloader, gateway, any_north, lines, (), Supervisor({}), parts_of(gateway))
+    reloader, lines = Reloader(path, before), RunningLines()
+    north: Any = SimpleNamespace(admission=SimpleNamespace(claiming=Claiming()))
+    live = LiveReload(reloader, gateway, north, lines, (), Supervisor({}), parts_of(gateway))
     config = load(write(path, press=vigor(3), mixer=vigor(1)))
     await live._reload(config)  # its only caller waits for a signal
     assert gateway.config is before

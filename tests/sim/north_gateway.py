@@ -66,7 +66,7 @@ class Process:
         self._serving = [asyncio.create_task(self.northbound.run(), name="northbound")]
         await self.northbound.exclusive.wait()
         self.history.start()
-        await self.northbound.active.wait()
+        await self.northbound.admission.active.wait()
         starting = list(self.gateway.mirror.samples())
         self.judge.publish(starting)
         self.publish(starting)

@@ -107,7 +107,7 @@ class Client:
         stem = self._keys.status("")
         found = {
             str(reply.ok.key_expr).removeprefix(stem): document(reply.ok.payload.to_bytes())
-            for reply in self._query(self._keys.statuses)
+            for reply in self._query(self._keys.status("**"))
             if reply.ok is not None
         }
         if "status" not in found:

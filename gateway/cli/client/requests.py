@@ -72,7 +72,7 @@ class Requests:
 
     def peek(self, device: str, text: str) -> dict[str, object]:
         """Returns `address`, `units` and `time`, or `error ...`. Raises as `write`."""
-        key, dialling = self._keys.peek(device), self._dialling.get(device, 0.0)
+        key, dialling = self._keys.command(device, "peek"), self._dialling.get(device, 0.0)
         return self._request(key, text.encode(), self._documents_of(device), dialling)
 
     def _documents_of(self, device: str) -> str:

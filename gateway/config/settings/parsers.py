@@ -141,10 +141,9 @@ def prefix(text: object) -> str:
 
 def endpoint(text: object) -> str:
     """Parses a Zenoh endpoint: `tcp/127.0.0.1:7447`."""
-    if not isinstance(text, str) or not _ENDPOINT.match(text):
-        raise ConfigError(f"{shown(text)} is no Zenoh endpoint: write tcp/127.0.0.1:7447")
-    check_address(text)
-    return text
+    found = _matching(_ENDPOINT, text, "is no Zenoh endpoint: write tcp/127.0.0.1:7447")
+    check_address(found)
+    return found
 
 
 def check_address(endpoint: str) -> None:
@@ -186,21 +185,14 @@ def local_address(text: object) -> str:
 
 def origin(text: object) -> str:
     """Parses `https://hmi.plant`, as a browser names the place of a page."""
-    if not isinstance(text, str) or not _ORIGIN.match(text):
-        raise ConfigError(
-            f"{shown(text)} is no origin: write https://hmi.plant or http://10.0.0.5:3000, "
-            "without a path"
-        )
-    return text.lower()
+    write = "write https://hmi.plant or http://10.0.0.5:3000, without a path"
+    return _matching(_ORIGIN, text, f"is no origin: {write}").lower()
 
 
 def host_name(text: object) -> str:
     """Parses `gateway.plant`, the name of a machine, in lower case."""
-    if not isinstance(text, str) or not _HOST_NAME.match(text):
-        raise ConfigError(
-            f"{shown(text)} is no name of a machine: write gateway.plant, without a port"
-        )
-    return text.lower()
+    wrong = "is no name of a machine: write gateway.plant, without a port"
+    return _matching(_HOST_NAME, text, wrong).lower()
 
 
 def every_digit(written: object, as_float: Callable[[object], float]) -> float:
@@ -279,12 +271,8 @@ def baudrate(value: object) -> int:
 
 def serial_format(text: object) -> str:
     """Parses `7E1`: data bits, parity, stop bits."""
-    if not isinstance(text, str) or not _FORMAT.match(text):
-        raise ConfigError(
-            f"{shown(text)} is no character format: write data bits (7 or 8), parity (N, E or O) "
-            "and stop bits (1 or 2), such as 7E1"
-        )
-    return text
+    write = "write data bits (7 or 8), parity (N, E or O) and stop bits (1 or 2), such as 7E1"
+    return _matching(_FORMAT, text, f"is no character format: {write}")
 
 
 def value_type(text: object) -> ValueType:
@@ -319,6 +307,12 @@ def _text(value: object) -> str:
     if not isinstance(value, str):
         raise ConfigError(f"{shown(value)} is no text")
     return value
+
+
+def _matching(rule: re.Pattern[str], text: object, wrong: str) -> str:
+    if not isinstance(text, str) or not rule.match(text):
+        raise ConfigError(f"{shown(text)} {wrong}")
+    return text
 
 
 def _lettered(letter: str) -> bool:

@@ -183,9 +183,9 @@ class Replies:
         until = self._clock() + (ANSWER_WITHIN if page is None else PAGE_WITHIN)
         last: Place = ("", 0, 0)
         count, again, lost, complete = 0, 0, None, False
-        is_own = str(query.key_expr) == self._keys.page
+        is_own = str(query.key_expr) == self._keys.status("page")
         batches = pages.Batches(
-            lambda data: self._reply(query, self._keys.page_samples, data, self._stamp())
+            lambda data: self._reply(query, self._keys.status("page/samples"), data, self._stamp())
         )
         for sample, place in found:
             if isinstance(sample, Damaged):
@@ -234,7 +234,7 @@ class Replies:
         lost: Damaged | None = None,
     ) -> None:
         end = pages.end(self._keys.gateway, count, place, complete=complete, again=again, lost=lost)
-        self._reply(query, self._keys.page, end, self._stamp())
+        self._reply(query, self._keys.status("page"), end, self._stamp())
 
     def _failed(self, error: GatewayError, query: zenoh.Query) -> None:
         is_query = isinstance(error, BadValue)
@@ -244,7 +244,7 @@ class Replies:
     def writes(self, now: int, query: zenoh.Query) -> None:
         """Replies with recorded outcomes, on the key of their publication; on the key of pages with
         the samples of all tags. `now` as in `history`."""
-        if str(query.key_expr) == self._keys.page:
+        if str(query.key_expr) == self._keys.status("page"):
             self.history(ParsedKey(Family.VALUE, self._keys.values), now, query)
             return
         key = self._keys.writes

@@ -154,7 +154,7 @@ class Declarations:
         """
         self._declare(self._plant_keys())
         puts = self._session.declare_subscriber(
-            self._keys.sets, _direct(self._puts), allowed_origin=zenoh.Locality.REMOTE
+            self._keys.set("**"), _direct(self._puts), allowed_origin=zenoh.Locality.REMOTE
         )
         self._others.append(puts)
 
@@ -170,14 +170,14 @@ class Declarations:
         self._others.append(self._session.liveliness().declare_token(self._keys.own))
 
     def _status_keys(self) -> list[str]:
-        return [self._keys.statuses, self._keys.describe, self._keys.introspect]
+        return [self._keys.status("**"), self._keys.describe, self._keys.introspect]
 
     def _plant_keys(self) -> list[str]:
         """Returns the keys of values, writes and commands; those of a line are status keys."""
-        commands = sorted(frozenset().union(*self._plant.commands().values()))
-        keys = [self._keys.values, self._keys.late, self._keys.metas, self._keys.sets]
-        keys += [self._keys.peek("*"), *map(self._keys.commands, commands)]
-        return [*keys, self._keys.blocks] if self._index.with_blocks else keys
+        commands = ["peek", *sorted(frozenset().union(*self._plant.commands().values()))]
+        keys = [self._keys.values, self._keys.late, self._keys.meta("**")]
+        keys += [self._keys.set("**"), *(self._keys.command("*", one) for one in commands)]
+        return [*keys, self._keys.block("*")] if self._index.with_blocks else keys
 
     def _declare(self, keys: Iterable[str]) -> None:
         for key in keys:

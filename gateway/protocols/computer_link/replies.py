@@ -49,11 +49,8 @@ def accept_text(station: int, decode: Callable[[str], T | None]) -> Callable[[Fr
     """Accepts data of the station; `decode` returns None for data of another request."""
 
     def accept(frame: Frame) -> T | None:
-        match frame:
-            case Text(source, data, pc) if source == station and pc == PC:
-                return decode(data)
-        _raise_refusal(frame, station)
-        return None
+        answer = _answer(frame, station)
+        return decode(answer.data) if isinstance(answer, Text) else None
 
     return accept
 
@@ -62,25 +59,24 @@ def accept_ack(station: int) -> Callable[[Frame], bool | None]:
     """Accepts the acknowledgement of the station."""
 
     def accept(frame: Frame) -> bool | None:
-        match frame:
-            case Ack(source, pc) if source == station and pc == PC:
-                return True
-        _raise_refusal(frame, station)
-        return None
+        return True if isinstance(_answer(frame, station), Ack) else None
 
     return accept
 
 
-def _raise_refusal(frame: Frame, station: int) -> None:
-    match frame:
-        case Nak(source, code, pc) if source == station and pc == PC:
-            refusal, meaning = _MEANINGS.get(code, (Refusal.OTHER, "an undefined error code"))
-            raise Refused(
-                f"station {station} answered NAK {code}, {meaning}",
-                code=code,
-                refusal=refusal,
-                unexecuted=code in _UNEXECUTED,
-            )
+def _answer(frame: Frame, station: int) -> Frame | None:
+    """Returns a reply of the station; None for another frame. Raises `Refused`."""
+    if frame.station != station or frame.pc != PC:
+        return None
+    if isinstance(frame, Nak):
+        refusal, meaning = _MEANINGS.get(frame.code, (Refusal.OTHER, "an undefined error code"))
+        raise Refused(
+            f"station {station} answered NAK {frame.code}, {meaning}",
+            code=frame.code,
+            refusal=refusal,
+            unexecuted=frame.code in _UNEXECUTED,
+        )
+    return frame
 
 
 def model_name(data: str) -> str | None:

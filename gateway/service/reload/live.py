@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from gateway.config import Config
 from gateway.config.changes import Difference, compare
+from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.northbound import Northbound
 from gateway.plant.plant import Plant
 from gateway.plant.threads import off_loop
@@ -37,7 +38,7 @@ class LiveReload:
                 file = await self._reloader.next()
                 if file is not None and not self._lines.started:
                     self._reloader.accept(file)
-                    self._northbound.replaced.set()
+                    self._northbound.admission.replaced.set()
                     return
                 if file is not None:
                     await self._reload(file)
@@ -47,9 +48,9 @@ class LiveReload:
             watching.cancel()
 
     async def _reload(self, file: Config) -> None:
-        plant, northbound = self._plant, self._northbound
-        config = file.without(northbound.withheld)
-        if taken := northbound.taken(device.name for device in config.devices):
+        plant, claiming = self._plant, self._northbound.admission.claiming
+        config = file.without(claiming.withheld)
+        if taken := claiming.taken(device.name for device in config.devices):
             self._reloader.refuse(
                 [f"device {name} belongs to gateway {other}" for name, other in taken.items()]
             )
@@ -65,14 +66,14 @@ class LiveReload:
         self._reloader.accept(file, difference)
 
     async def _take_over(self, difference: Difference, file: Config) -> None:
-        northbound = self._northbound
+        northbound, claiming = self._northbound, self._northbound.admission.claiming
         names = {device.name for device in file.devices}
-        index = await off_loop(northbound.index, difference.config.devices)
+        index = await off_loop(TagIndex, northbound.keys, difference.config.devices)
         # A device is claimed before its first request, and until after its last one.
-        await northbound.claim(names.union(d.name for d in self._reloader.current.devices))
+        await claiming.change(names.union(d.name for d in self._reloader.current.devices))
         await Renewal(self._plant, self._lines, difference).run()
         await northbound.change(index)
-        await northbound.claim(names)
+        await claiming.change(names)
         _collect()
 
 
