@@ -83,9 +83,10 @@ def _title(documents: Documents) -> str:
 
 def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> RenderableType:
     """Returns the whole status. `outcomes` of the last hour; None without history."""
-    gateway = documents["status"]
+    tags = documents["status"]["tags"]
+    size = f"{tags} tag" if tags == 1 else f"{tags} tags"
     parts: list[RenderableType] = [
-        Text(printable(f"{_title(documents)}, {gateway['tags']} tags{_standby(documents)}")),
+        Text(printable(f"{_title(documents)}, {size}{_standby(documents)}")),
         Text(),
         _lines(documents),
         Text(),

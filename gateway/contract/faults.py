@@ -68,8 +68,8 @@ def _of_parts(documents: Documents) -> Iterator[Fault]:
             yield Fault("door-closed", text, f"doors/{door}")
     for way, document in below("notify/", documents):
         if document["trouble"]:
-            wait = f"{document['waiting']} messages about alarms wait since {document['oldest']}"
-            text = f"{way} does not work: {document['trouble']}; {wait}"
+            wait = f"{document['waiting']} waiting since {document['oldest']}"
+            text = f"{way} does not work: {document['trouble']}; messages about alarms: {wait}"
             yield Fault("notify", text, f"notify/{way}")
     for part, document in below("files/", documents):
         if document["trouble"]:
@@ -85,9 +85,9 @@ def certificate_fault(setting: str, document: Document) -> str:
         return f"{setting} {file}: {document['trouble']}"
     if days < 0:
         who = "Zenoh" if setting.startswith("zenoh") else "the other side"
-        return f"{setting} {file} expired {-days:.0f} days ago: {who} accepts no new connection"
+        return f"{setting} {file} expired {-days:.0f} d ago: {who} accepts no new connection"
     if days < DAYS_LEFT:
-        return f"{setting} {file} expires in {days:.0f} days: renew it"
+        return f"{setting} {file} expires in {days:.0f} d: renew it"
     return ""
 
 
@@ -103,16 +103,7 @@ def coded_warnings(documents: Documents) -> Iterator[Fault]:
         for text in device["refused_addresses"]:
             yield Fault("addresses-refused", text, f"devices/{name}")
     for line, document in below("lines/", documents):
-        devices = _devices_of(document, documents)
-        yield from device_warnings(line, [one for one in devices if one[0] not in unreachable])
-        load, about = document["expected"]["load"], f"lines/{line}"
-        if load > 1.0:
-            text = f"line {line} is asked for {load:.1f} times what it carries: see `check`"
-            yield Fault("overloaded", text, about)
-        calls = document.get("calls") or {}
-        if document["open"] and calls.get("in_a_row"):
-            text = f"line {line}: the last call failed: {calls['last_failure']}"
-            yield Fault("call-failed", text, about)
+        yield from _of_line(line, document, documents, unreachable)
     yield from _of_others(documents["status"])
     yield from _held_up(documents, unreachable)
     reload = documents.get("reload", {})
@@ -123,6 +114,21 @@ def coded_warnings(documents: Documents) -> Iterator[Fault]:
     yield from _of_remote(documents.get("remote/file", {"state": "none"}))
     yield from _of_times(documents)
     yield from _of_history(documents)
+
+
+def _of_line(
+    line: str, document: Document, documents: Documents, unreachable: set[str]
+) -> Iterator[Fault]:
+    devices = _devices_of(document, documents)
+    yield from device_warnings(line, [one for one in devices if one[0] not in unreachable])
+    load, about = document["expected"]["load"], f"lines/{line}"
+    if load > 1.0:
+        text = f"line {line}: asked for {load:.1f} times what it carries: see `check`"
+        yield Fault("overloaded", text, about)
+    calls = document.get("calls") or {}
+    if document["open"] and calls.get("in_a_row"):
+        text = f"line {line}: the last call failed: {calls['last_failure']}"
+        yield Fault("call-failed", text, about)
 
 
 def _of_times(documents: Documents) -> Iterator[Fault]:
@@ -144,7 +150,7 @@ def _of_times(documents: Documents) -> Iterator[Fault]:
 
 def _of_history(documents: Documents) -> Iterator[Fault]:
     if lost := documents.get("history", {}).get("lost"):
-        yield Fault("samples-lost", f"history: {lost} samples were lost since the start", "history")
+        yield Fault("samples-lost", f"history: samples lost since the start: {lost}", "history")
     if (days := disk_days(documents)) is not None and days < DAYS_OF_DISK:
         text = f"history: its disk is full in {days:.1f} days: make room, or a smaller `max_size`"
         yield Fault("disk-fills", text, "history")
@@ -191,7 +197,7 @@ def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:
     for line, document in below("lines/", documents):
         devices = _devices_of(document, documents)
         wrong = () if stands_by(documents) else line_fault(line, document, devices)
-        told = device_warnings(line, [one for one in devices if one[0] not in unreachable])
+        told = _of_line(line, document, documents, unreachable)
         found[line] = [one.text for one in wrong], [one.text for one in told]
     return found
 

@@ -109,7 +109,7 @@ def _renew(pki: Path, days: int) -> None:
 
 def test_a_certificate_says_how_long_it_is_valid_and_is_renewed(tmp_path: Path) -> None:
     file, pki = _plant(tmp_path, 12)
-    said = f"zenoh.tls.certificate {pki / 'gateway.pem'} expires in 12 days: renew it"
+    said = f"zenoh.tls.certificate {pki / 'gateway.pem'} expires in 12 d: renew it"
     checked = plc_gateway("check", file)
     assert said in " ".join((checked.out + checked.err).split())
     with started(file) as program:
@@ -210,12 +210,12 @@ def test_a_gateway_that_connects_takes_its_renewed_certificate_without_a_start(
 
 def test_an_expired_certificate_is_a_fault() -> None:
     expired = {"file": "hall.pem", "expires": None, "days": -3.2, "trouble": ""}
-    said = "zenoh.tls.certificate hall.pem expired 3 days ago: Zenoh accepts no new connection"
+    said = "zenoh.tls.certificate hall.pem expired 3 d ago: Zenoh accepts no new connection"
     assert list(faults({"certificates/certificate": expired})) == [said]
     lost = {"file": "hall.pem", "expires": None, "days": None, "trouble": "Permission denied"}
     said = "zenoh.tls.ca hall.pem: Permission denied"
     assert list(faults({"certificates/ca": lost})) == [said]
-    said = "lines.b.tls.ca hall.pem expired 3 days ago: the other side accepts no new connection"
+    said = "lines.b.tls.ca hall.pem expired 3 d ago: the other side accepts no new connection"
     assert list(faults({"certificates/lines.b.tls.ca": expired})) == [said]
 
 

@@ -104,7 +104,7 @@ def changed(healthy: dict[str, Any], path: str, **fields: object) -> dict[str, A
 def test_history_that_is_not_written_is_a_fault(healthy: dict[str, Any]) -> None:
     full = changed(healthy, "history", state="the disk is full", waiting=3, lost=2)
     assert list(faults(full)) == ["history: the disk is full"]
-    assert "history: 2 samples were lost since the start" in list(warnings(full))
+    assert "history: samples lost since the start: 2" in list(warnings(full))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_history_that_is_not_written_is_a_fault(healthy: dict[str, Any]) -> None
     [
         ("devices/mixer", {"diagnosis": "Answers twice"}, "mixer: Answers twice"),
         ("devices/mixer", {"refused_addresses": ["D9 of mixer: refused"]}, "D9 of mixer: refused"),
-        ("lines/hall", {"expected": {"load": 1.84}}, "line hall is asked for 1.8 times what"),
+        ("lines/hall", {"expected": {"load": 1.84}}, "line hall: asked for 1.8 times what"),
         ("status", {"refused_devices": {"oven": "other"}}, "oven is served by another gateway"),
     ],
 )

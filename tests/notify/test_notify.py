@@ -41,7 +41,7 @@ def test_a_message_survives_a_dead_server_and_a_killed_gateway(tmp_path: Path) -
         until(lambda: "waiting" in _saved(config), "the message is saved")
         told = plc_gateway("status", config)
         assert told.code == 1
-        assert "mail does not work: connection refused; 1 messages" in told.out
+        assert "mail does not work: connection refused; messages about alarms: 1" in told.out
         gateway.end(signal.SIGKILL)
     with mail_server(box, port=port), started(config) as gateway:
         gateway.says("alarm message sent", "mixer/level (simulated) raised: Tank full")

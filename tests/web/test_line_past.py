@@ -47,6 +47,14 @@ def test_a_state_is_noted_once_with_its_cause_and_without_its_figures(loads: Loa
     assert "74%" not in loads.timelines["hall"][-1][2]
 
 
+def test_an_overloaded_line_has_a_warning_and_no_green_timeline(loads: Loads) -> None:
+    both = documents({"expected": {"load": 1.84}}, standing="up", diagnosis="")
+    loads.note(both, 0)
+    assert loads.timelines["hall"] == (
+        (0, "warning", "line hall: asked for 1.8 times what it carries: see `check`"),
+    )
+
+
 def test_a_silent_line_that_is_opened_again_is_not_well_meanwhile(loads: Loads) -> None:
     starts = {"devices": {"mixer": "up", "oven": "starting"}}
     loads.note(documents({"open": False, "trouble": ""}), 0)

@@ -325,6 +325,30 @@ CUT = """
 """
 
 
+async def test_hostile_texts_hide_nothing_and_turn_no_digits(tab: Tab) -> None:
+    long, turned = "x" * 10_000, "\u202eabc\u2067"
+    hot = AlarmRule({Level.HIGH: 5.0}, text=long)
+    tags = [
+        tag("oven", "long", unit=long, description=long, alarm=hot, write=WriteRule()),
+        tag("oven", "turned", unit=turned, description=turned, alarm=AlarmRule({Level.HIGH: 5.0})),
+        tag("oven", "n" * 180, description=EVIL, unit=EVIL, write=WriteRule()),
+    ]
+    plant = PlainPlant(PlainDevice("oven", tuple(tags)))
+    plant.alarms.judge([plant.now(one.key, 91.5) for one in tags])
+    async with serving(plant=plant) as client:
+        await tab.look(390, 844)
+        for view in ("overview", "tags", "alarms", "trend?tags=oven/long,oven/turned"):
+            await opened(tab, client, view)
+            shown = ".view:not([hidden]) :is(.tile, .alarm, .pen, #space .row)"
+            await tab.until(f"document.querySelectorAll('{shown}').length > 1")
+            heights = f"[...document.querySelectorAll('{shown}')].map((one) => one.offsetHeight)"
+            assert max(await tab.value(heights)) < 400, view
+            assert await tab.value("document.documentElement.scrollWidth") <= 390
+            assert await tab.value("document.querySelectorAll('main img').length") == 0
+            text_shown = await tab.value("document.body.textContent")
+            assert not {"\u202e", "\u2067"} & {*text_shown}
+
+
 @pytest.mark.parametrize(
     ("width", "height", "language"),
     [(390, 844, "de"), (1920, 1080, "en")],  # German has the longest words

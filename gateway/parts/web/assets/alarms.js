@@ -3,6 +3,7 @@
 import { byId, h, keyed, moment, put, style } from "./dom.js";
 import { said, several, t } from "./language.js";
 import { api, gateway, on, operator, post, signedIn } from "./stream.js";
+import { unitOf } from "./values.js";
 
 const SHORT = 6; // in the overview
 const PAGE = 1000; // alarms of one request
@@ -104,9 +105,10 @@ function makeRow() {
 
 function showRow(row, one) {
   row.alarm = one;
-  const { quality, reason, value, unit, acknowledged, state } = one;
-  const text = typeof value === "boolean" || value === "true" || value === "false" ? "" : quality === "good" ? `${value} ${unit}`.trim() : `${said("bad")}: ${said(reason ?? "not known")}`;
+  const { quality, reason, value, acknowledged, state } = one;
+  const text = typeof value === "boolean" || value === "true" || value === "false" ? "" : quality === "good" ? `${value} ${unitOf(one)}`.trim() : `${said("bad")}: ${said(reason ?? "not known")}`;
   put(row.why, one.why);
+  row.why.title = one.why;
   put(row.detail, one.detail && !one.why.includes(one.detail) ? said(one.detail) : "");
   const done = state === "acknowledged";
   const time = moment(Date.parse(done ? acknowledged.time : one.since));

@@ -185,8 +185,9 @@ function makeLine([name]) {
 function showLine(card, line) {
   const [name, open, , expected, rate] = line;
   put(card.state, stateOf(line));
-  style(card.state, `pill ${open ? "good" : "wrong"}`);
-  keyed(card.causes, causesOf(line), ([, text]) => text.replace(TIMES, ""), () => {
+  const causes = causesOf(line);
+  style(card.state, `pill ${!open ? "wrong" : causes.length ? "" : "good"}`);
+  keyed(card.causes, causes, ([, text]) => text.replace(TIMES, ""), () => {
     const item = h("li");
     item.head = h("b");
     item.rest = h("span");

@@ -102,7 +102,7 @@ function makeTile(key) {
   tile.append(
     h("div", { className: "bar" },
       h("a", { className: "name", href: `#trend?tags=${encodeURIComponent(key)}`, title: title({ meta }) }, rest.join("/"), h("span", { className: "hidden" }, `, ${t("trend of {key}", { key })}`)),
-      meta.write && writeButton(key)),
+      meta.write && writeButton(key, "✎")), // a word does not fit beside a name
     tile.about, parts.value, tile.spark, tile.alarm,
     h("p", { className: "foot" }, parts.quality, tile.limits, parts.age),
   );
@@ -112,11 +112,12 @@ function makeTile(key) {
 function showTile(tile, key) {
   const tag = tagOf(key);
   const live = gateway.live && tag.current;
-  showParts(tile.parts, tag, live);
+  showParts(tile.parts, tag, live, true);
   put(tile.limits, limits(tag));
   drawSpark(tile.spark, tag);
   const alarm = alarmsOf(key);
   put(tile.alarm, alarm ? alarm.why : "");
+  tile.alarm.title = tile.alarm.textContent;
   tile.alarm.hidden = !alarm;
   const bad = tag.last && !tag.last.good;
   style(tile, `tile ${alarm ? `in-alarm ${alarm.state}` : ""} ${bad ? "is-bad" : ""} ${live ? "" : "old"}`);

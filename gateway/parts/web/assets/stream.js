@@ -85,11 +85,14 @@ on("state", ({ you }) => {
 
 // -- requests --
 
+// Characters that turn the direction of text would turn the digits beside them too.
+const plain = (text) => text.replace(/[\u202a-\u202e\u2066-\u2069]/g, "");
+
 export async function api(path, query = {}, options = {}) {
   const reply = await fetch(`api/${path}?${new URLSearchParams(query)}`, {
     cache: "no-store", ...options, headers: { ...headers(), ...options.headers },
   });
-  const text = await reply.text();
+  const text = plain(await reply.text());
   // The text of a value is kept as it was sent: a number of JavaScript would round it.
   return { ok: reply.ok, found: JSON.parse(text.replace(/"value":(-?\d[\d.eE+-]*|\[[^\]"]*\])/g, '"value":"$1"')) };
 }
@@ -166,7 +169,7 @@ async function read(body, mine) {
   for (;;) {
     const { value, done } = await reader.read();
     if (done || stream !== mine) return;
-    const events = (rest + value).split("\n\n");
+    const events = (rest + plain(value)).split("\n\n");
     rest = events.pop();
     for (const event of events) {
       if (stream !== mine) return;

@@ -7,6 +7,7 @@ import { now } from "./stream.js";
 const TRAIL = 15 * 60e3; // ms of a sparkline
 const POINTS = 300; // of a sparkline
 const LONGEST_LIST = 120; // characters of an array that are shown
+const LONGEST_UNIT = 24; // characters
 
 const known = new Map();
 
@@ -16,9 +17,12 @@ export function tagOf(key) {
   return known.get(key);
 }
 
+// A unit is shown with its end cut off, so that it cannot hide the values beside it.
+export const unitOf = ({ unit }) => (unit.length > LONGEST_UNIT ? `${unit.slice(0, LONGEST_UNIT)}…` : unit);
+
 export function describe(meta) {
   const tag = tagOf(meta.tag);
-  tag.meta = meta;
+  tag.meta = { ...meta, unit: unitOf(meta) };
   tag.decimals = decimals(meta);
   return tag;
 }
@@ -65,7 +69,8 @@ export function shown(tag) {
 // The code of the reason and its sentence, or where the value is from.
 export const reasons = (why) => why.replace(/^(\S+) ?(.*)$/s, (_, code, rest) => `${said(code)} ${said(rest)}`).trim();
 
-const quality = ({ last }) => (!last ? "" : last.good ? reasons(last.why) || t("good") : `${said(last.quality)}: ${reasons(last.why).split(/: |：/)[0]}`);
+// `short`: without the sentence after the code.
+const quality = ({ last }, short) => (!last ? "" : last.good ? reasons(last.why) || t("good") : `${said(last.quality)}: ${reasons(short ? last.why.split(" ")[0] : last.why).split(/: |：/)[0]}`);
 
 export const age = ({ last }) => (last && now() ? span(Math.max(0, (now() - last.time) / 1000)) : "");
 
@@ -142,15 +147,15 @@ export function valueParts() {
   return parts;
 }
 
-// `live`: false when the value may be old.
-export function showParts(parts, tag, live) {
+// `live`: false when the value may be old. `short`: where a sentence has no room.
+export function showParts(parts, tag, live, short = false) {
   const [text, unit, tip] = shown(tag);
   put(parts.number, text);
   put(parts.unit, unit);
   if (parts.value.title !== tip) parts.value.title = tip;
   const good = tag.last?.good;
   parts.quality.title = good === false ? reasons(tag.last.why) : "";
-  put(parts.quality, !tag.last ? "" : live ? quality(tag) : t("not live"));
+  put(parts.quality, !tag.last ? "" : live ? quality(tag, short) : t("not live"));
   style(parts.quality, `quality ${!live || !tag.last ? "" : good ? "good" : "bad"}`);
   put(parts.age, age(tag));
 }

@@ -8,8 +8,9 @@ import { shown, tagOf } from "./values.js";
 let open = null; // the editor
 
 // Hidden by the class `read-only` of the page where nothing can be written.
-export function writeButton(key) {
-  return h("button", { type: "button", className: "quiet write", "aria-label": t("write {key}", { key }), onclick: (event) => edit(key, event.currentTarget) }, t("Write"));
+export function writeButton(key, text = t("Write")) {
+  const label = t("write {key}", { key });
+  return h("button", { type: "button", className: "quiet write", title: label, "aria-label": label, onclick: (event) => edit(key, event.currentTarget) }, text);
 }
 
 async function edit(key, button) {
