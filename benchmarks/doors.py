@@ -4,7 +4,9 @@ A gateway polls 300 registers of libmodbus' slave behind a wire of 19200 baud. P
 doors: mbpoll, libmodbus' master, npm's modbus-serial and pymodbus, alone and two at once, and two
 that ask for 125 registers without a pause. The wire itself counts the polls. It prints how many
 were lost against the same time without programs, and the longest time between two reads of one
-block, beside the worst age that `check` prints.
+block, beside the worst age that `check` prints. It also prints how long a poll took, from its
+request to the end of its reply, and the share of the time that programs had: on a busy computer
+both take longer than planned, and the wire may be full.
 """
 
 import argparse
@@ -23,6 +25,7 @@ import tty
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing import Pipe, Process
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -41,6 +44,15 @@ BLOCKS, SIZE = 10, 30
 FIRST, APART = 2000, 200  # polled registers; programs ask for others
 
 
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """A request and its reply on the wire. Times in seconds. `block`: None for a program's."""
+
+    block: int | None
+    asked: float
+    ended: float
+
+
 class Wire:
     """Two ptys with a wire between them, in a process of its own."""
 
@@ -49,32 +61,35 @@ class Wire:
         for _, slave in self._ends:
             tty.setraw(slave)
         self.gateway, self.plc = (os.ttyname(slave) for _, slave in self._ends)
-        self._polls, theirs = Pipe()
+        self._done, theirs = Pipe()
         self._process = Process(target=self._carry, args=(theirs,), daemon=True)
         self._process.start()
-        self._found = list[tuple[float, int]]()
+        self._found = list[Exchange]()
         threading.Thread(target=self._note, daemon=True).start()
 
     def _note(self) -> None:
         """Takes the reports: the wire waits for none."""
         with suppress(EOFError):
             while True:
-                self._found.append(self._polls.recv())
+                self._found.append(Exchange(*self._done.recv()))
 
-    def _carry(self, polls: Connection) -> None:
-        """Passes bytes on when their last character has passed, and reports each poll."""
+    def _carry(self, done: Connection) -> None:
+        """Passes bytes on when their last character has passed, and reports each exchange."""
         ours, theirs = (master for master, _ in self._ends)
+        block, asked = None, 0.0
         while True:
             for end in select.select([ours, theirs], [], [])[0]:
                 began, data = time.monotonic(), os.read(end, 4096)
-                if end == ours and (block := _block(data)) is not None:
-                    polls.send((began, block))
+                if end == ours:
+                    block, asked = _block(data), began
                 pause = len(data) * BITS / BAUD + (TURNAROUND if end == theirs else 0.0)
                 time.sleep(max(0.0, began + pause - time.monotonic()))
                 os.write(theirs if end == ours else ours, data)
+                if end == theirs:
+                    done.send((block, asked, time.monotonic()))
 
-    def polls(self) -> list[tuple[float, int]]:
-        """Returns the time and the block of each poll since the last call."""
+    def exchanges(self) -> list[Exchange]:
+        """Returns the exchanges since the last call."""
         found, self._found = self._found, []
         return found
 
@@ -189,28 +204,40 @@ def built(folder: Path) -> tuple[Path, Path]:
     return folder / "modbus_slave", folder / "modbus_master"
 
 
-async def counted(
-    wire: Wire, work: Callable[[], Awaitable[None]], seconds: float
-) -> tuple[int, float]:
-    """Returns the polls in so many seconds, and the longest time between two of one block."""
+@dataclass(frozen=True, slots=True)
+class Use:
+    """The use of the wire in a time. `longest`: seconds between two polls of a block."""
+
+    polls: int
+    longest: float
+    poll: float  # seconds of one poll, in the mean
+    guests: float  # share of the time in exchanges of programs
+
+
+async def counted(wire: Wire, work: Callable[[], Awaitable[None]], seconds: float) -> Use:
     task = asyncio.ensure_future(work())
     await asyncio.sleep(min(2.0, seconds))  # the program has begun
-    wire.polls()
+    wire.exchanges()
     done, _ = await asyncio.wait([task], timeout=seconds)
-    polls = wire.polls()
-    for one in done:
-        one.result()
+    exchanges = wire.exchanges()
+    for ended in done:
+        ended.result()
     task.cancel()
     with suppress(asyncio.CancelledError):
         await task
-    times = defaultdict[int, list[float]](list)
-    for at, first in polls:
-        times[first].append(at)
+    times, took, guests = defaultdict[int, list[float]](list), 0.0, 0.0
+    for one in exchanges:
+        if one.block is None:
+            guests += one.ended - one.asked
+        else:
+            times[one.block].append(one.asked)
+            took += one.ended - one.asked
     gaps = (b - a for row in times.values() for a, b in itertools.pairwise(row))
-    return len(polls), max(gaps, default=0.0)
+    polls = sum(map(len, times.values()))
+    return Use(polls, max(gaps, default=0.0), took / max(1, polls), guests / seconds)
 
 
-async def measured(names: Sequence[str], seconds: float, folder: Path) -> None:
+async def measured(names: Sequence[str], rounds: int, seconds: float, folder: Path) -> None:
     slave, master = built(folder)
     wire, ports = Wire(), (free_port(), free_port())
     file = plant(folder, wire.gateway, ports)
@@ -218,16 +245,19 @@ async def measured(names: Sequence[str], seconds: float, folder: Path) -> None:
     async with running(slave, "rtu", wire.plc, "1", ready=b"ready"):
         with started(file) as gateway:
             gateway.says("device online", "press")
-            programs, alone = Programs(master, *ports), 0
+            programs, alone = Programs(master, *ports), 1
             await asyncio.sleep(min(5.0, seconds))
-            for name in ("none", *names):
+            for name in ("none", *names) * rounds:
                 programs.requests = programs.unanswered = 0
-                polls, longest = await counted(wire, getattr(programs, name), seconds)
-                alone = alone or polls
-                rate, lost = programs.requests / seconds, 1 - polls / (alone or 1)
+                use = await counted(wire, getattr(programs, name), seconds)
+                if name == "none":
+                    alone = use.polls or 1
+                rate, lost = programs.requests / seconds, 1 - use.polls / alone
                 print(
-                    f"{name:<13} {rate:5.1f} requests/s, {programs.unanswered} unanswered; "
-                    f"polls {polls:5}, {lost:6.1%} lost, {longest:.2f} s between two of a block"
+                    f"{name:<13} {rate:5.1f} requests/s, {programs.unanswered} unanswered, "
+                    f"{use.guests:5.1%} of the time; polls {use.polls:5}, {lost:6.1%} lost, "
+                    f"{1000 * use.poll:.0f} ms each, {use.longest:.2f} s between two of a block",
+                    flush=True,
                 )
             gateway.lines.clear()
     wire.end()
@@ -236,11 +266,12 @@ async def measured(names: Sequence[str], seconds: float, folder: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--rounds", type=int, default=1, help="with programs and without, in turn")
     every = ["mbpoll", "libmodbus", "modbus_serial", "pymodbus", "both", "flood"]
     parser.add_argument("--programs", nargs="+", default=every, choices=every)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        asyncio.run(measured(asked.programs, asked.seconds, Path(folder)))
+        asyncio.run(measured(asked.programs, asked.rounds, asked.seconds, Path(folder)))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
-from gateway.engine.device.records import LineRecord
+from gateway.engine.device.records import LineRecord, Resyncs
 from gateway.engine.device.reply_shapes import WARY
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.jobs.jobs import (
@@ -83,7 +83,7 @@ class Engine:
         shared = (self.record, self.schedule, in_flight, staleness, health, effects)
         self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
         # Its use of the wire grows: by due polls, and probes; that of the line by requests.
-        self._charged: Device | LineRecord | None = None
+        self._charged: Device | LineRecord | Resyncs | None = None
         self._replies = 0  # of all stations, until the port was opened
 
     # The cycle of the line
@@ -99,7 +99,7 @@ class Engine:
     def _next(self, now: float) -> Job:
         in_flight, rules = self._in_flight, self.rules
         if in_flight.continuation is not None:
-            return in_flight.resume(now)
+            return in_flight.resume(now, self.record)
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
         job: Transacted | PollEntry | Idle | Reopen | None
@@ -119,7 +119,7 @@ class Engine:
         elif isinstance(job, Reopen):
             return job
         else:
-            others = job.device if isinstance(job, Probe) else None
+            others = in_flight.payer(job, self.record) if isinstance(job, Probe) else None
             self._charged = others if isinstance(job, Probe | Answer | Identify) else self.record
             if (shapes := job.device.shapes) is not None:
                 if isinstance(job, Probe):
@@ -167,7 +167,7 @@ class Engine:
             in_flight.job = None
             in_flight.failed.clear()
             charged = self._charged
-            if charged is not None and (charged is self.record or len(self.devices) > 1):
+            if charged is not None and (len(self.devices) > 1 or not isinstance(charged, Device)):
                 charged.used(now, in_flight.begun)
         effects, self._effects.collected = self._effects.collected, []
         if not good or len(effects) != 1 or self.deadline <= now:

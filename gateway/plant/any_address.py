@@ -17,6 +17,7 @@ from gateway.protocols.ranges import addresses, spans
 from gateway.tags import Tag
 
 MOST_PEEKED = 256  # addresses of one peek
+LOST = 0.02  # share of polls: more are lost where the wire has no time for them
 MOST_TARGETS = 1000  # that are remembered
 
 
@@ -55,6 +56,22 @@ class AnyAddress:
     def requested(self, device: str) -> float:
         """Returns the seconds that the line of the device has spent on requests so far."""
         return self._places[device][0].engine.record.requested if device in self._places else 0.0
+
+    def resyncs(self, device: str) -> float:
+        """Returns the seconds of the resyncs after requests that the line got no reply to."""
+        here = device in self._places
+        return self._places[device][0].engine.record.resyncs.seconds if here else 0.0
+
+    def is_late(self, device: str) -> bool:
+        """Returns True while the line of the device loses polls: its wire has no time for them."""
+        engine = self.place(device)[0].engine
+        due = done = 0.0  # polls a second
+        for one in engine.devices:
+            for poll in engine.polls(one) if one.health.online else ():
+                if poll.reads.at is not None and poll.reads.mean_gap:
+                    due += 1 / one.interval(poll.block)
+                    done += 1 / poll.reads.mean_gap
+        return done < (1 - LOST) * due
 
     def known(self, device: str, span: Span, max_age: float) -> list[int] | None:
         """Returns the units if a poll has read all of them together in the last `max_age` seconds,

@@ -340,6 +340,32 @@ async def test_programs_get_their_share_and_no_more() -> None:
 
 
 @on_virtual_time
+async def test_programs_give_way_while_polls_are_lost() -> None:
+    """Polls need four fifths of the wire, and two programs want all of it: 9 % were lost."""
+    tags = {
+        f"t{n}": {"address": f"holding:{1000 + 200 * n}", "type": "uint16[30]"} for n in range(10)
+    }
+    press = {**PRESS, "tags": tags, "defaults": {"every": "600ms"}}
+    settings = door("hall", "modbus-tcp", most="30%", reply_within="5s")
+    async with opened(settings, {"hall": {**LINES["hall"], "devices": {"press": press}}}) as hall:
+        seen, replies = list[float](), 0
+        hall.plant.doors.seers = [lambda _: seen.append(now())]
+
+        async def flood(program: Program) -> None:
+            nonlocal replies
+            while True:
+                replies += bool(await program.ask(tcp("03 0064 007d"), wait=0.05))
+
+        begun = now()
+        floods = [asyncio.create_task(flood(Program(hall.door))) for _ in range(2)]
+        await asyncio.sleep(60)
+        for one in floods:
+            one.cancel()
+        assert len(seen) > 0.95 * 10 * (now() - begun) / 0.6
+        assert replies > 20  # they get a third of their share at least
+
+
+@on_virtual_time
 async def test_a_read_that_needs_several_requests_costs_them_all() -> None:
     """It was free: programs took two thirds of the wire with `most: 5%`."""
     press = {**PRESS, "max_read_words": 10}
@@ -354,10 +380,16 @@ async def test_a_read_that_needs_several_requests_costs_them_all() -> None:
 class Slow:
     """Addresses that take 3 s of the line to read, and time out. In place of `AnyAddress`."""
 
-    spent = 0.0
+    spent = resynced = 0.0
 
     def requested(self, _device: str) -> float:
         return self.spent
+
+    def resyncs(self, _device: str) -> float:
+        return self.resynced
+
+    def is_late(self, _device: str) -> bool:
+        return False
 
     async def read(self, *_: object) -> list[int]:
         await asyncio.sleep(3)
@@ -379,6 +411,9 @@ async def test_the_time_of_a_share_is_measured_and_each_door_has_its_own() -> No
         assert await turns.carry_out(step, small, "a test", 20.0) is NOT_NOW  # 3 s / 10 % is 30 s
         assert await turns.carry_out(step, large, "a test", 1.0) is NO_REPLY
         assert await turns.carry_out(step, small, "a test", 30.0) is NO_REPLY
+        slow.resynced = 0.5  # that of the last request: it was free
+        assert await turns.carry_out(step, small, "a test", 31.0) is NOT_NOW
+        assert await turns.carry_out(step, small, "a test", 36.0) is NO_REPLY
 
 
 @on_virtual_time

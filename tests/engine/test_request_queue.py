@@ -3,10 +3,10 @@
 import pytest
 
 from gateway.engine.device.health import State
-from gateway.engine.jobs.jobs import Sent
+from gateway.engine.jobs.jobs import Confirm, Probe, Resynced, Sent
 from gateway.engine.jobs.request_queue import MOST_PEEKS, MOST_WAITING, RequestQueue
 from gateway.engine.jobs.requests import Command
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import EVERY_REQUEST, Span
 from tests.engine.rig import Rig
 from tests.sim.plant import device
 
@@ -51,3 +51,25 @@ def test_the_time_of_requests_is_counted_with_their_time_outs_and_that_of_polls_
     rig.command()
     rig.fail(rig.transacted())
     assert record.requested == pytest.approx(0.25 + 0.6)
+    assert record.resyncs.seconds == 0.0
+    probe = rig.transacted()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, Resynced(EVERY_REQUEST), took=0.2)
+    assert record.resyncs.seconds == pytest.approx(0.2)  # it is due to the command
+    rig.fail(rig.transacted())
+    rig.conclude(rig.transacted(), Resynced(EVERY_REQUEST), took=0.2)
+    assert record.resyncs.seconds == pytest.approx(0.2)  # to the poll
+
+
+def test_the_time_of_a_write_is_counted_with_the_read_that_shows_its_outcome() -> None:
+    """Only that read counted, where the write had got no reply."""
+    rig = Rig()
+    rig.bring(State.ONLINE)
+    rig.write("D2")
+    begun = rig.now
+    rig.fail(rig.transacted())
+    confirm = rig.transacted()
+    assert isinstance(confirm, Confirm)
+    rig.conclude(confirm, Sent(held=[0]), took=0.2)
+    assert rig.engine.record.requested == pytest.approx(rig.now - begun)
+    assert rig.now - begun > 0.5

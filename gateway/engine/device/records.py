@@ -93,6 +93,16 @@ class Falls:
 
 
 @dataclass(slots=True)
+class Resyncs:
+    """The resyncs that requests without a reply made necessary."""
+
+    seconds: float = 0.0
+
+    def used(self, now: float, begun: float) -> None:
+        self.seconds += now - begun
+
+
+@dataclass(slots=True)
 class LineRecord:
     """Counts of a line since the start. Times in seconds."""
 
@@ -102,6 +112,7 @@ class LineRecord:
     busy: float = 0.0  # characters on the wire, both ways
     turnarounds: float = 0.0  # of stations that replied
     requested: float = 0.0  # in transactions of writes, commands and peeks
+    resyncs: Resyncs = field(default_factory=Resyncs)
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
     last_trouble: str = ""  # why the port was not open last

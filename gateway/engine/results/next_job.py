@@ -249,6 +249,8 @@ class NextJob:
             confirm = self._requests.settled(settle, now)
             if confirm is not None:
                 self._in_flight.follow(confirm)
+            elif device.health.needs_resync and not isinstance(after, Identify):
+                self._in_flight.owe(device)
 
     def abandon(self, error: LineDown | None, now: float) -> None:
         """Ends the job, because the port was lost or the gateway stops."""

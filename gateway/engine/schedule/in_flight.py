@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import Confirm, Poll, ReadBack, Repeat, Transacted
+from gateway.engine.device.records import LineRecord, Resyncs
+from gateway.engine.jobs.jobs import Confirm, Poll, Probe, ReadBack, Repeat, Transacted
 from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.errors import DeviceError
 
@@ -30,10 +31,22 @@ class InFlight:
     continuation: Transacted | PollEntry | None = None
     held: list[HeldRead] = field(default_factory=list)  # of one device; one proof is for all
     doubted: bool = False  # an extra reply arrived since the first of them
+    owing: Device | None = None  # its next resync is due to a request without a reply
 
     def follow(self, job: Transacted | PollEntry) -> None:
         """Notes the job that must follow."""
         self.continuation = job
+
+    def owe(self, device: Device) -> None:
+        """Notes that a request made a resync necessary."""
+        self.owing = device
+
+    def payer(self, probe: Probe, record: LineRecord) -> Device | Resyncs:
+        """Returns the account that the seconds of a probe go to."""
+        if probe.device is not self.owing:
+            return probe.device
+        self.owing = None
+        return record.resyncs
 
     def hold(self, read: HeldRead) -> None:
         """Notes a read whose values wait."""
@@ -63,7 +76,7 @@ class InFlight:
         self.open.clear()
         self.failed.clear()
 
-    def resume(self, now: float) -> Transacted:
+    def resume(self, now: float, record: LineRecord) -> Transacted:
         """Returns the continuation. All but polls, `Settle` and `Probe` begin their own time."""
         job, self.continuation = self.continuation, None
         if job is None:
@@ -73,5 +86,6 @@ class InFlight:
             job = job.job
         self.job = job
         if isinstance(job, ReadBack | Confirm | Repeat):
+            record.used(now, self.begun)
             self.begun = now
         return job

@@ -12,6 +12,7 @@ from gateway.plant.any_address import AnyAddress
 from gateway.stations.store import Cell, Denied, Rejected, Why
 
 Outcome = Mapping[Cell, int] | Denied | Rejected
+GIVES_WAY = 3.0  # while polls are late, programs get this part of their share
 _MINUTE = 60.0  # seconds over which the share is measured
 
 
@@ -36,7 +37,9 @@ class GuestRequests:
         self._turn = asyncio.Lock()
         # By the loop's clock: when the share of each door allows its next request; of all: "".
         self._free_at = dict[str, float]()
+        self._late_at = dict[str, float]()  # the same while polls are late
         self._most = most
+        self._unclear: tuple[Door, float] | None = None  # the last one, and the resyncs until then
         self._share, self._shared_at = 0.0, 0.0
 
     async def carry_out(self, step: Step, door: Door, by: str, within: float) -> Outcome:
@@ -51,10 +54,15 @@ class GuestRequests:
         except TimeoutError:
             return NOT_NOW
         try:
+            self._spend_resync(step.device)
             free_at = max(self._free_at.get(name, 0.0) for name in (door.name, ""))
             if free_at > ends:
                 return NOT_NOW
             await asyncio.sleep(free_at - loop.time())
+            if self._any.is_late(step.device):
+                late_at = max(self._late_at.get(name, 0.0) for name in (door.name, ""))
+                wait = late_at - loop.time()
+                await asyncio.sleep(min(wait, (ends - loop.time()) / 2))  # the reply is in time
             left = ends - loop.time()
             before = self._any.requested(step.device)
             try:
@@ -68,6 +76,7 @@ class GuestRequests:
         except Busy:
             return NOT_NOW
         except GatewayError:
+            self._unclear = door, self._any.resyncs(step.device)
             return NO_REPLY
         finally:
             self._turn.release()
@@ -125,6 +134,15 @@ class GuestRequests:
         for name, most in ((door.name, door.most), ("", self._most)):
             begun = max(self._free_at.get(name, 0.0), now - seconds)
             self._free_at[name] = begun + seconds / most
+            self._late_at[name] = begun + GIVES_WAY * seconds / most
+
+    def _spend_resync(self, device: str) -> None:
+        """Notes the time of the resync after a request without a reply, once it has ended."""
+        if self._unclear is not None:
+            door, before = self._unclear
+            if (seconds := self._any.resyncs(device) - before) > 0.0:
+                self._unclear = None
+                self._spend(seconds, door)
 
     def share(self, now: float) -> float:
         """Returns the share of the wire time in the last minute."""
