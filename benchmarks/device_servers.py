@@ -28,8 +28,16 @@ from tests.zenoh_peer import free_endpoint
 HEARTBEAT = 10.0  # seconds
 READ = 8  # bytes of a request
 TO_A_POLL = 3  # replies on a connection: to two requests of a resync, and to a poll
-REPLY = bytes([1, 3, 2, 0, 7])
-REPLY += crc16(REPLY)
+
+
+def reply(request: bytes) -> bytes:
+    """Returns the reply of the slave: all its registers hold 7."""
+    station, function = request[:2]
+    frame = bytes([station, function | 0x80, 1])  # it has no other function
+    if function == 3:
+        data = bytes([0, 7]) * int.from_bytes(request[4:6])
+        frame = bytes([station, function, len(data)]) + data
+    return frame + crc16(frame)
 
 
 class DeviceServer:
@@ -56,11 +64,11 @@ class DeviceServer:
         beats = asyncio.create_task(self._beat(writer))
         try:
             while True:
-                await reader.readexactly(READ)
+                request = await reader.readexactly(READ)
                 await asyncio.sleep(self._delay)
                 if writer.is_closing():
                     return
-                writer.write(REPLY)
+                writer.write(reply(request))
                 self._replies += 1
                 if self._replies >= TO_A_POLL:
                     self.answered.set()
