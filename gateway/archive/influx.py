@@ -39,21 +39,23 @@ class InfluxStore:
                 "http://host:8181/api/v3/write_lp?db=name"
             )
         self._write = address
-        query = urlencode({"db": database, "q": _CURSORS})
+        query = urlencode({"db": database, "q": _CURSORS, "epoch": "ns"})
         self._query = f"{parts.scheme}://{parts.netloc}/query?{query}"
+        self._last = 0  # ns since 1970, of the newest cursor: the next one must be newer
 
     def cursors(self) -> Mapping[str, Cursor]:
         """A server without `/query` has none: its points are written again from the beginning."""
         try:
             result = orjson.loads(self._request(self._query))["results"][0]
-            rows = [one["values"][0][1] for one in result.get("series", ())]
+            rows = [one["values"][0] for one in result.get("series", ())]
+            self._last = max([self._last, *(at for at, _ in rows)])
         except (ValueError, TypeError, LookupError):
             raise StoreDown("the answer to a query of cursors is none of InfluxDB") from None
         except urllib.error.HTTPError as error:
             if error.code == http.HTTPStatus.NOT_FOUND:
                 return {}
             raise StoreDown(f"cursors: {error}, {error.read(200)!r}") from None
-        cursors = [cursor_of(text) for text in rows]
+        cursors = [cursor_of(text) for _, text in rows]
         return {cursor.gateway: cursor for cursor in cursors}
 
     def add(self, rows: Sequence[Row], before: Cursor, after: Cursor) -> Cursor:
@@ -71,7 +73,8 @@ class InfluxStore:
                 after = after.with_gap(Gap(min(times), max(times), why))
         after = after.with_rows(rows, len(rows))
         fields = f"document={quoted(after.to_json())}"
-        line = f"plc_archive,gateway={escaped(after.gateway)} {fields} {time.time_ns()}"
+        self._last = max(self._last + 1, time.time_ns())  # a clock may be set back
+        line = f"plc_archive,gateway={escaped(after.gateway)} {fields} {self._last}"
         try:
             self._request(self._write, line.encode())
         except urllib.error.HTTPError as error:

@@ -69,9 +69,22 @@ def load(
 def digest(data: Mapping[str, Any], config: Config) -> str:
     """Returns a digest of all settings of a file, of its templates and its sheets, without comments
     and layout: files of one digest make gateways that do the same."""
-    content = [data, *(sheet.raw for sheet in config.sheets)]
-    packed = json.dumps(content, default=str)
+    sheets = {sheet.device: sheet.raw for sheet in config.sheets}
+    packed = json.dumps(_with_sheets(data, sheets) if sheets else data, default=str)
     return hashlib.sha256(packed.encode()).hexdigest()[:_DIGITS]
+
+
+def _with_sheets(data: Mapping[str, Any], sheets: Mapping[str, Mapping[str, object]]) -> Any:
+    """Returns the data as if the tags of the sheets were in the file itself."""
+    lines = {}
+    for line, raw in data["lines"].items():
+        devices = dict(raw["devices"])
+        for name in devices.keys() & sheets.keys():
+            own = {key: value for key, value in devices[name].items() if key != "tags_from"}
+            tags = own.pop("tags", None) or {}
+            devices[name] = {**own, "tags": {**tags, **sheets[name]}}
+        lines[line] = {**raw, "devices": devices}
+    return {**data, "lines": lines}
 
 
 def expanded_text(path: str | Path) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from tests.archive.servers import Postgres, postgres, s3
+from tests.archive.servers import InfluxDb, Postgres, influx, postgres, s3
 from tests.archive.test_archive import (
     Found,
     Hall,
@@ -32,7 +32,14 @@ from tests.zenoh_peer import free_endpoint
 LONGEST = 1.5  # seconds between two kills
 
 
-def archived_in(server: Postgres) -> Found:
+def archived_in(server: Postgres | InfluxDb) -> Found:
+    """InfluxDB has the keys without the prefix."""
+    if isinstance(server, InfluxDb):
+        points = server.influx.query('SELECT device, "name", good, reason FROM plc')
+        return Found(
+            (f"{device.partition('-')[0]} plant/{device}/{name}", at, reason)
+            for at, device, name, _, reason in points
+        )
     rows = server.rows(
         "SELECT key, (extract(epoch FROM time) * 1000000)::bigint, reason FROM plc_history"
     )
@@ -45,7 +52,7 @@ def archived_in(server: Postgres) -> Found:
 class Campaign:
     """The programs of a plant, each of which can be killed and started again."""
 
-    def __init__(self, folder: Path, store: object, server: Postgres | None) -> None:
+    def __init__(self, folder: Path, store: object, server: Postgres | InfluxDb | None) -> None:
         self._endpoint, self._store, self._server = free_endpoint(), store, server
         self._halls = [
             Hall(folder, "demo", self._endpoint, listen=[self._endpoint]),
@@ -149,7 +156,11 @@ def campaign(store: str, kills: int, seed: int) -> int:
     """Returns the number of samples. Raises `AssertionError` for a lost or doubled one."""
     choice = random.Random(seed)
     with tempfile.TemporaryDirectory() as name, ExitStack() as ends:
-        server = ends.enter_context(postgres()) if store == "postgres" else None
+        server: Postgres | InfluxDb | None = None
+        if store == "postgres":
+            server = ends.enter_context(postgres())
+        elif store == "influx":
+            server = ends.enter_context(influx())
         place: object = Path(name) / "archive" if server is None else server.address
         if store == "s3":
             place = ends.enter_context(s3())
@@ -159,7 +170,7 @@ def campaign(store: str, kills: int, seed: int) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200, help="shared by the stores")
-    parser.add_argument("--store", nargs="*", default=["parquet", "s3", "postgres"])
+    parser.add_argument("--store", nargs="*", default=["parquet", "s3", "postgres", "influx"])
     parser.add_argument("--seed", type=int, default=int(time.time()))
     given = parser.parse_args()
     kills = given.kills // len(given.store)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import psycopg
 
+from tests.bridges.test_influx import Influx
 from tests.conftest import lacking, needs
 from tests.e2e.processes import ROOT, Program, free_port, until
 
@@ -81,6 +82,36 @@ class Postgres:
 
 def _children(pid: int) -> list[int]:
     return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+class InfluxDb:
+    """A server with an empty database `plant`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.influx = Influx(needs("influxd"), folder)
+        self.address = f"{self.influx.url}/write?db=plant"
+        self.server: Program | None = None
+
+    def start(self) -> None:
+        self.server = self.influx.run()
+
+    def kill(self) -> None:
+        assert self.server is not None
+        self.server.end(signal.SIGKILL)
+
+
+@contextmanager
+def influx() -> Iterator[InfluxDb]:
+    """Yields a server that runs."""
+    with tempfile.TemporaryDirectory(prefix="plc-influx-") as name:
+        found = InfluxDb(Path(name))
+        try:
+            found.start()
+            found.influx.query("CREATE DATABASE plant")
+            yield found
+        finally:
+            if found.server is not None:
+                found.server.__exit__()
 
 
 @contextmanager

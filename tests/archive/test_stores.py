@@ -247,7 +247,9 @@ def test_a_killed_postgres_has_all_of_a_page_or_nothing(database: Postgres) -> N
 # -- InfluxDB --
 
 
-def test_influx_has_each_point_once_and_the_cursor(influxd: str, tmp_path: Path) -> None:
+def test_influx_has_each_point_once_and_the_cursor(
+    influxd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     influx = Influx(influxd, tmp_path)
     store, begun = InfluxStore(f"{influx.url}/write?db=plant"), Cursor(DEMO)
     with pytest.raises(StoreDown):
@@ -264,6 +266,10 @@ def test_influx_has_each_point_once_and_the_cursor(influxd: str, tmp_path: Path)
         assert count == len(ROWS)
         [[_, text]] = influx.query("SELECT text FROM plc WHERE \"name\"='t2'")
         assert text == str(2**64 - 1)
+        monkeypatch.setattr("time.time_ns", lambda: NOON * 1000)  # the clock is set back
+        other = InfluxStore(f"{influx.url}/write?db=plant")
+        later = other.add([], other.cursors()[DEMO], after(cursor, "12"))
+        assert other.cursors() == {DEMO: later}
 
 
 def test_samples_that_influx_refuses_are_a_gap() -> None:

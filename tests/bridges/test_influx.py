@@ -64,8 +64,8 @@ class Influx:
         return program
 
     def query(self, text: str) -> list[list[Any]]:
-        """Returns the rows of an answer."""
-        about = urllib.parse.urlencode({"q": text, "db": "plant"}).encode()
+        """Returns the rows of an answer, each with its time in microseconds since 1970."""
+        about = urllib.parse.urlencode({"q": text, "db": "plant", "epoch": "u"}).encode()
         with urllib.request.urlopen(f"{self.url}/query", about, timeout=300) as answer:  # noqa: S310
             [result] = json.load(answer)["results"]
         rows: list[list[Any]] = result.get("series", [{"values": []}])[0]["values"]

@@ -16,6 +16,7 @@ from gateway.config.messages import Mistakes
 from gateway.config.templates.expand import expanded
 from gateway.config.templates.files import SHIPPED
 from gateway.config.templates.text import filled
+from gateway.config.whole import whole_text
 from gateway.config.yaml.file import YamlFile, read_yaml
 from gateway.errors import ConfigError
 from gateway.tags import Tag
@@ -76,6 +77,10 @@ def loaded(folder: Path, text: str) -> Config:
     # Tags are equal to themselves only. The names of the templates are gone, nothing else.
     plain = re.sub(r"templates=\([^)]*\)", "templates=()", repr(config))
     assert repr(load(alone)) == plain
+    # As it travels to another machine, which has no other file of it.
+    (elsewhere := folder / "elsewhere").mkdir(exist_ok=True)
+    (there := elsewhere / "plant.yaml").write_text(whole_text(path), encoding="utf-8")
+    assert load(there).digest == config.digest
     return config
 
 

@@ -260,6 +260,14 @@ WRONG: list[tuple[dict[str, Any], type[GatewayError], str]] = [
     ({"do": "revert"}, BadValue, "no file waits"),
     ({"do": "rollback", "digest": "x"}, Unknown, "no earlier file x"),
     ({"do": "erase"}, BadValue, "do is none of"),
+    ({"do": "apply", "patch": {}}, BadValue, "runs a file with these settings already"),
+    ({"do": "apply", "patch": []}, BadValue, "`patch` is settings"),
+    ({"do": "apply", "patch": {}, "file": "x"}, BadValue, "`patch` is settings"),
+    ({"do": "rollback", "patch": {}, "digest": "x"}, BadValue, "`patch` is settings"),
+    ({"do": "apply", "patch": {"lines": {"hall": {"port": 7}}}}, BadValue, r"plant\.yaml:\d+: "),
+    ({"do": "check", "patch": {"remote": {"writers": ["b"]}}}, BadValue, "remote.writers changed"),
+    ({"do": "apply", "patch": {"writers": None}}, BadValue, "it needs writers"),
+    ({"do": "apply", "file": file("D1"), "digest": "x"}, BadValue, "here the file is .*, not x"),
     ({"do": None}, BadValue, "do is none of"),
 ]
 
@@ -284,6 +292,27 @@ def test_what_is_refused_changes_nothing(run_virtual: Virtual, tmp_path: Path) -
         assert (await ask(part, "check", file=file("D1")))["state"] == "none"
         assert gateway.path.read_text() == file("D0")
         assert gateway.loaded == [gateway.current.digest]
+
+    run_virtual(whole())
+
+
+def test_a_patch_changes_a_device_and_goes_back_with_all_comments(
+    run_virtual: Virtual, tmp_path: Path
+) -> None:
+    async def whole() -> None:
+        gateway = Gateway(tmp_path)
+        gateway.path.write_text(before := f"# The hall\n{file('D0')}")
+        part = await gateway.part()
+        pump = {"use": "pump", "base": 7, "station": 2}
+        template = {"parameters": ["base"], "tags": {"flow": {"address": "D{base}"}}}
+        more = {
+            "lines": {"hall": {"devices": {"mixer": None, "pump": {"protocol": "vigor", **pump}}}}
+        }
+        await ask(part, "apply", patch={"templates": {"pump": template}, **more})
+        [device] = gateway.current.devices
+        assert [tag.text for tag in device.tags] == ["D7"]
+        await ask(part, "revert")
+        assert gateway.path.read_text() == before
 
     run_virtual(whole())
 

@@ -46,6 +46,10 @@ def test_a_file_is_given_confirmed_and_put_back_after_a_kill(tmp_path: Path) -> 
         assert FAITHFUL.violations("remote", last) == []
         assert FAITHFUL.violations("file order", last) == []
         assert (last["state"], last["digest"]) == ("confirmed", load(new).digest)
+        patch = tmp_path / "patch.yaml"
+        patch.write_text("lines: {hall: {devices: {mixer: {tags: {speed: {address: D1000000}}}}}}")
+        done = remote(own, "--patch", patch, "--check")
+        assert (done.code, "D1000000" in done.err) == (1, True)
         # Nobody answers the question: it waits, and the gateway dies.
         remote(own, "--rollback", last["before"], "--look", "100ms")
         assert json.loads(remote(own).out)["state"] == "waiting"

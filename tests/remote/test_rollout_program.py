@@ -1,4 +1,7 @@
-"""A rollout at real programs: a table of three gateways, files that break them, a partition."""
+"""A rollout at real programs: a table of three gateways, files that break them, a partition.
+
+Each test begins and ends with every pump at `D1`: another worker may run any of them.
+"""
 
 import json
 import shutil
@@ -20,8 +23,8 @@ QUICK = ("--wait", "1s", "--look", "1s", "--within", "5min")
 TEMPLATE = """\
 # The pumping station ${name}
 gateway: {name: ${name}}
-writers: {file: writers.txt}
-remote: {writers: [ana]}
+writers: {file: ${secrets}}
+remote: {writers: [${writer}]}
 zenoh: {prefix: works/${area}, mode: client, listen: [], connect: [${router}]}
 defaults: {every: ${every}}
 templates: {pump: {parameters: [base], tags: {speed: {address: "D{base}"}}}}
@@ -59,6 +62,7 @@ class Plant:
         """Writes the files: every pump at `D<base>`, and other cells of gateway b."""
         rows = {
             name: {"name": name, "area": "north", "router": self.endpoint, "every": "200ms"}
+            | {"secrets": "writers.txt", "writer": "ana"}
             | {"port": "simulator", "base": base, "station": 1, "slow": "reply_timeout: 2s"}
             for name in "abc"
         }
@@ -86,7 +90,7 @@ class Plant:
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     plant = Plant(tmp_path_factory.mktemp("plant"))
-    done = plant.render(0)
+    done = plant.render(1)
     assert "3 files written" in done.out, done.err
     with ExitStack() as stack:
         stack.enter_context(router(plant.endpoint))
@@ -94,9 +98,10 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
         for name in "abc":
             plant.own(name).parent.mkdir()
             shutil.copy(plant.files / f"{name}.yaml", plant.own(name))
-            secret = plant.own(name).with_name("writers.txt")
-            secret.write_text(f"ana:{SECRET}\n")
-            secret.chmod(0o600)
+            for secret in ("writers.txt", "others.txt"):
+                file = plant.own(name).with_name(secret)
+                file.write_text(f"ana:{SECRET}\n")
+                file.chmod(0o600)
         with plant.between:
             plant.between.enter_context(router(plant.other, connect=plant.endpoint))
             for name in "abc":
@@ -114,8 +119,8 @@ def results(found: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def test_all_gateways_get_their_files_and_the_next_run_finds_them_there(plant: Plant) -> None:
-    assert "3 files written, 0 were so already" in plant.render(1).out
-    assert "0 files written, 3 were so already" in plant.render(1).out
+    assert "3 files written, 0 were so already" in plant.render(2).out
+    assert "0 files written, 3 were so already" in plant.render(2).out
     shown = plc_gateway("fleet", "works", "--connect", plant.endpoint, "--folder", plant.files)
     assert shown.out.count("its file differs from") == 3
     done, found = plant.apply("--check")
@@ -123,8 +128,19 @@ def test_all_gateways_get_their_files_and_the_next_run_finds_them_there(plant: P
     done, found = plant.apply()
     assert (done.code, results(found)) == (0, 3 * ["confirmed"]), done.err
     assert plant.own("a").read_text() == (plant.files / "a.yaml").read_text()
+    # A sheet travels in the file.
+    (plant.files / "a.csv").write_text("name,address\nlevel,D9\n")
+    file = plant.files / "a.yaml"
+    file.write_text(
+        file.read_text().replace("protocol: vigor", "protocol: vigor, tags_from: a.csv")
+    )
+    done, found = plant.apply()
+    assert (done.code, results(found)) == (0, ["confirmed", "same", "same"]), done.err
+    assert "level: {address: D9}" in plant.own("a").read_text()
     done, found = plant.apply()
     assert (done.code, results(found)) == (0, 3 * ["same"])
+    plant.render(1)
+    assert plant.apply()[0].code == 0
 
 
 def test_a_file_that_breaks_a_device_goes_back_and_stops_the_rollout(plant: Plant) -> None:
@@ -143,10 +159,14 @@ def test_a_file_that_breaks_a_device_goes_back_and_stops_the_rollout(plant: Plan
         assert "base: 1," in plant.own(name).read_text()
 
 
-def test_a_file_that_overloads_a_line_or_needs_a_restart_is_refused(plant: Plant) -> None:
+def test_a_file_that_overloads_a_line_cuts_the_network_or_locks_writers_out_is_refused(
+    plant: Plant,
+) -> None:
     for of_b, says in (
         ({"every": "1ms"}, "line hall is asked for"),
         ({"router": "tcp/127.0.0.1:1"}, "zenoh.connect changed"),
+        ({"writer": "bob"}, "remote.writers changed"),
+        ({"secrets": "others.txt"}, "writers.file changed"),
     ):
         plant.render(1, **of_b)
         done, found = plant.apply()
@@ -177,7 +197,7 @@ def test_a_partition_in_the_middle_of_a_rollout(plant: Plant) -> None:
     alone = plant.folder / "alone"
     alone.mkdir()
     shutil.copy(plant.files / "c.yaml", alone)
-    pace = ("--canary", 0, "--look", "10s", "--within", "10s")
+    pace = ("--canary", 0, "--look", "20s", "--within", "10s")
     c = plant.programs["c"]
     lines = len(c.lines)
     rollout = ("fleet", "works", "apply", alone, "--connect", plant.endpoint, *pace)
@@ -191,6 +211,8 @@ def test_a_partition_in_the_middle_of_a_rollout(plant: Plant) -> None:
     done, found = plant.apply()
     assert (done.code, results(found)) == (1, ["confirmed", "confirmed", "unreachable"])
     assert "2 have the new file" in done.err
-    with router(plant.other, connect=plant.endpoint):
-        until(lambda: plant.apply()[0].code == 0, "c has its file")
+    plant.between.enter_context(router(plant.other, connect=plant.endpoint))
+    until(lambda: plant.apply()[0].code == 0, "c has its file")
     assert "base: 4," in plant.own("c").read_text()
+    plant.render(1)
+    assert plant.apply()[0].code == 0

@@ -13,13 +13,13 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from gateway import files
 from gateway.cli.client import Client
 from gateway.cli.fleet.health import read_remote
 from gateway.cli.fleet.place import Connect, Place
 from gateway.cli.fleet.rollout import DONE, KEY, Ended, Pace, Result, Rollout, Step
 from gateway.cli.terminal import FAILED, AsJson, ZenohFile, err, out, printable
 from gateway.config.settings.parsers import interval
+from gateway.config.whole import whole_text
 from gateway.contract.documents.fleet import RemoteDocument
 from gateway.contract.fleet_files import Wanted
 from gateway.contract.fleet_rows import Told, gateway_of, told_by
@@ -128,16 +128,9 @@ def _steps(
         elif one.report["digest"] == want.digest:
             ended.append(Ended(gateway, Result.SAME))
         else:
-            steps[gateway] = Step({"do": do, "file": _text(want.file)}, want.digest)
+            order = {"do": do, "file": whole_text(want.file), "digest": want.digest}
+            steps[gateway] = Step(order, want.digest)
     return steps, ended
-
-
-def _text(file: Path) -> str:
-    """Raises `ConfigError`."""
-    try:
-        return files.read(file).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} cannot be read: {error}") from None
 
 
 def _tell(ended: Ended) -> None:

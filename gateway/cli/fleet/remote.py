@@ -7,11 +7,12 @@ from typing import Annotated, Any
 
 import typer
 
-from gateway import files
 from gateway.cli.client import Client, reached
 from gateway.cli.fleet.rollout import KEY, LOADING
 from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
 from gateway.config.settings.parsers import interval
+from gateway.config.whole import whole_text
+from gateway.config.yaml.file import TEXTS, read_yaml
 from gateway.contract.faults import faults
 from gateway.errors import ConfigError
 
@@ -20,6 +21,9 @@ def remote(
     config: ConfigPath,
     new: Annotated[Path | None, typer.Argument(metavar="[NEW]", help="The other file.")] = None,
     check: Annotated[bool, typer.Option("--check", help="Check it on the gateway only.")] = False,
+    patch: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings that change, instead of NEW.")
+    ] = None,
     rollback: Annotated[
         str | None, typer.Option(metavar="DIGEST", help="An earlier file instead of NEW.")
     ] = None,
@@ -31,9 +35,11 @@ def remote(
     within: Annotated[str, typer.Option(help="Then an unconfirmed file goes back.")] = "10min",
 ) -> None:
     """Give a running gateway another file, which goes back by itself unless confirmed."""
-    if sum((new is not None, rollback is not None, revert)) > 1 or (check and new is None):
-        raise ConfigError("write one of NEW, --rollback DIGEST and --revert; --check needs NEW")
-    looks, order = interval(look), _order(new, rollback, check=check, revert=revert)
+    given = [new is not None, patch is not None, rollback is not None, revert]
+    if sum(given) > 1 or (check and not any(given[:2])):
+        one = "write one of NEW, --patch FILE, --rollback DIGEST and --revert"
+        raise ConfigError(f"{one}; --check needs NEW or --patch")
+    looks, order = interval(look), _order(new, patch, rollback, check=check, revert=revert)
     with reached(config, err.print) as client:
         if order is None:
             print(json.dumps(client.status(KEY)))
@@ -62,20 +68,19 @@ def remote(
 
 
 def _order(
-    new: Path | None, rollback: str | None, *, check: bool, revert: bool
+    new: Path | None, patch: Path | None, rollback: str | None, *, check: bool, revert: bool
 ) -> dict[str, Any] | None:
     """Raises `ConfigError`."""
+    do = "check" if check else "apply"
+    if patch is not None:
+        file, mistakes = read_yaml(patch, TEXTS)
+        mistakes.raise_all()
+        return {"do": do, "patch": file.data}
     if rollback is not None:
         return {"do": "rollback", "digest": rollback}
     if revert:
         return {"do": "revert"}
-    if new is None:
-        return None
-    try:
-        text = files.read(new).decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{new} cannot be read: {error}") from None
-    return {"do": "check" if check else "apply", "file": text}
+    return None if new is None else {"do": do, "file": whole_text(new)}
 
 
 def _sent(client: Client, order: dict[str, Any]) -> dict[str, Any]:

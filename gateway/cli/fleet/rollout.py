@@ -141,21 +141,17 @@ class Rollout:
         change = self._loaded(one, step, look + within, until)
         if isinstance(change, tuple):
             return Ended(name, *change)
-        is_other = change["digest"] != step.digest
-        wrong = () if is_other else self._watched(one, before, began + look, until)
+        wrong = self._watched(one, before, began + look, until)
         if wrong is None:
             why = f"no answer since it loaded the file: it goes back by itself at {change['until']}"
             return Ended(name, Result.LOST, why)
-        if not wrong and not is_other and not self._stop.is_set():
+        if not wrong and not self._stop.is_set():
             return Ended(name, *self._confirmed(one, step.digest, until))
         end = self._sent(one, {"do": "revert"}, until)
         is_back = end is not None and end["state"] == "reverted"
         back = "it went back" if is_back else f"it goes back by itself at {change['until']}"
         if wrong:
             return Ended(name, Result.WORSE, f"{'; '.join(wrong)}: {back}")
-        if is_other:
-            why = "its sheets or templates are not those beside the file here"
-            return Ended(name, Result.REFUSED, f"{why}: {back}")
         return Ended(name, Result.BACK, f"{back}: {self._why}")
 
     def _loaded(

@@ -1,13 +1,14 @@
 """The configuration file on disk, and the earlier ones beside it. Everything here blocks."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gateway import files
 from gateway.config import Config, ConfigErrors, load
-from gateway.errors import BadValue
+from gateway.config.whole import patched_text
+from gateway.errors import BadValue, ConfigError
 
 _MOST_TOLD = 5  # mistakes in one answer
 
@@ -35,6 +36,13 @@ class Folder:
             mistakes = str(error).splitlines()
             more = f" and {len(mistakes) - _MOST_TOLD} more" if len(mistakes) > _MOST_TOLD else ""
             raise BadValue(f"{'; '.join(mistakes[:_MOST_TOLD])}{more}") from None
+
+    def patched(self, patch: Mapping[str, Any]) -> str:
+        """Returns the text of the file with other settings. Raises `BadValue`."""
+        try:
+            return patched_text(self.path, patch)
+        except ConfigError as error:
+            raise BadValue(str(error)) from None
 
     def digest(self) -> str:
         """Returns the digest of the file as it is on disk now; empty: it cannot be loaded."""

@@ -1,7 +1,8 @@
 """The orders of a writer: another file, its confirmation, and the way back."""
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import orjson
 
@@ -9,7 +10,7 @@ from gateway.errors import BadValue
 from gateway.parts.remote.settings import LONGEST_WAIT
 
 SHORTEST_WAIT = 10.0  # seconds
-_FIELDS = {"do", "file", "confirm", "digest"}
+_FIELDS = {"do", "file", "patch", "confirm", "digest"}
 
 
 class Do(StrEnum):
@@ -23,11 +24,13 @@ class Do(StrEnum):
 
 
 class Order(NamedTuple):
-    """One order. `file`: the whole text; `confirm`: seconds until it goes back; `digest`: of the
-    file that is confirmed, or of an earlier one."""
+    """One order. `file`: the whole text; `patch`: in place of it, settings that change;
+    `confirm`: seconds until it goes back; `digest`: of the file that is confirmed, of an earlier
+    one, or of the new one, if the writer knows it."""
 
     do: Do
     file: str = ""
+    patch: Mapping[str, Any] | None = None
     confirm: float | None = None
     digest: str = ""
 
@@ -44,6 +47,11 @@ def parse_order(data: bytes) -> Order:
     if not isinstance(do, str) or do not in [*Do]:
         raise BadValue(f"do is none of {', '.join(Do)}")
     needed = {Do.CHECK: "file", Do.APPLY: "file", Do.CONFIRM: "digest", Do.ROLLBACK: "digest"}
+    patch = found.get("patch")
+    if patch is not None and (
+        not isinstance(patch, dict) or "file" in found or needed.pop(Do(do), "") != "file"
+    ):
+        raise BadValue("`patch` is settings by section, in place of `file`")
     for name in ("file", "digest"):
         text = found.get(name, "")
         if not isinstance(text, str) or (needed.get(Do(do)) == name and not text):
@@ -55,4 +63,4 @@ def parse_order(data: bytes) -> Order:
         or not SHORTEST_WAIT <= wait <= LONGEST_WAIT
     ):
         raise BadValue(f"confirm is no number from {SHORTEST_WAIT:.0f} to {LONGEST_WAIT:.0f}")
-    return Order(Do(do), found.get("file", ""), wait, found.get("digest", ""))
+    return Order(Do(do), found.get("file", ""), patch, wait, found.get("digest", ""))

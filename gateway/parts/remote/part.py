@@ -113,14 +113,14 @@ class RemotePart:
         waits = self._change.state == "waiting"
         match order.do:
             case Do.CHECK:
-                await self._checked(order.file)
+                await self._checked(await self._wanted(order), order.digest)
             case Do.APPLY | Do.ROLLBACK if waits:
                 until = rfc3339(self._change.until)
                 raise Busy(f"the file of {self._change.by} waits for confirmation until {until}")
             case Do.APPLY:
-                await self._apply(order.file, order.confirm, by)
+                await self._apply(await self._wanted(order), order, by)
             case Do.ROLLBACK:
-                await self._apply(await self._text_of(order.digest), order.confirm, by)
+                await self._apply(await self._text_of(order.digest), order, by)
             case _ if not waits:
                 raise BadValue("no file waits for confirmation")
             case Do.REVERT:
@@ -130,10 +130,18 @@ class RemotePart:
             case Do.CONFIRM:
                 await self._note(replace(self._change, state="confirmed", why=f"by {by}"))
 
-    async def _checked(self, text: str) -> Config:
-        """Raises `BadValue` with the mistakes, for what only a restart takes over, and for a line
-        that would carry more than it can."""
+    async def _wanted(self, order: Order) -> str:
+        if order.patch is None:
+            return order.file
+        return await off_loop(self._folder.patched, order.patch, within=DISK_WITHIN)
+
+    async def _checked(self, text: str, digest: str) -> Config:
+        """Raises `BadValue` with the mistakes, for a file that is not the one of the writer, for
+        what only a restart takes over, and for a line that would carry more than it can."""
         found = await off_loop(self._folder.checked, text, within=DISK_WITHIN)
+        if digest not in ("", found.digest):
+            other = "sheets and templates here, or those of this version, are others"
+            raise BadValue(f"here the file is {found.digest}, not {payload.short(digest)}: {other}")
         if changed := needs_restart(self._file.current, found):
             text = "this needs a restart, and a person beside the gateway"
             raise BadValue(f"{', '.join(changed)} changed: {text}")
@@ -154,17 +162,17 @@ class RemotePart:
                 return await off_loop(self._folder.text, kept.file, within=DISK_WITHIN)
         raise Unknown(f"there is no earlier file {payload.short(digest)}")
 
-    async def _apply(self, text: str, confirm: float | None, by: str) -> None:
+    async def _apply(self, text: str, order: Order, by: str) -> None:
         if not self._active:
             raise Busy("this gateway stands by: the active one takes a file")
-        found, running = await self._checked(text), self._file.current.digest
+        found, running = await self._checked(text, order.digest), self._file.current.digest
         if found.digest == running:
             raise BadValue("the gateway runs a file with these settings already")
         if await off_loop(self._folder.digest, within=DISK_WITHIN) != running:
             raise BadValue("the file on disk was changed and not loaded: a person works on it")
         now = self._core.plant.wall()
         copy = await off_loop(self._folder.keep, running, now, within=DISK_WITHIN)
-        seconds = confirm or self._settings.confirm
+        seconds = order.confirm or self._settings.confirm
         until = now + round(seconds * 1e9)
         last = self._change
         try:
