@@ -1,8 +1,9 @@
-"""The last resort at the end of a program: it ends although a thread, or a library, does not."""
+"""The end of a program: on a signal, and at last although a thread, or a library, does not end."""
 
 import asyncio
 import faulthandler
 import os
+import signal
 import sys
 import threading
 from contextlib import suppress
@@ -31,6 +32,20 @@ class LastResort:
     def cancel(self) -> None:
         self._timer.cancel()
         faulthandler.cancel_dump_traceback_later()
+
+
+def stop_event(*more: signal.Signals) -> asyncio.Event:
+    """Returns an event that SIGTERM, SIGINT and `more` set. From then on the `LastResort` runs."""
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    last = LastResort(loop)
+
+    def end() -> None:
+        stop.set()
+        last.start()
+
+    for number in (signal.SIGTERM, signal.SIGINT, *more):
+        loop.add_signal_handler(number, end)
+    return stop
 
 
 def _end(loop: asyncio.AbstractEventLoop) -> None:

@@ -82,7 +82,7 @@ def alarms(
     if len(given) > 1 or bool(given) is not (by is not None):
         raise ConfigError("give one of --ack, --shelve and others, with --by NAME, the operator")
     if not given:
-        with reached(config, err.print) as client:
+        with reached(config, err.print, waits=watch and not as_json) as client:
             since = None if past is None else f"now(-{parsers.duration(past):g}s)"
             _print(client, since, watch=watch, every=every, as_json=as_json)
         return

@@ -37,7 +37,15 @@ def _keys(config: "Config") -> list[str]:
     return [tag.key for device in config.devices for tag in device.tags]
 
 
+def _alarms(config: "Config") -> list[str]:
+    from gateway.tags import AlarmRule
+
+    devices = config.devices
+    of_tags = [tag.key for one in devices for tag in one.tags if tag.feature(AlarmRule)]
+    return [*of_tags, *(one.name for one in devices), *(f"line:{one.name}" for one in config.lines)]
+
+
 tags = _of(lambda config: [device.name for device in config.devices] + _keys(config))
 devices = _of(lambda config: [device.name for device in config.devices])
 lines = _of(lambda config: [line.name for line in config.lines])
-alarms = _of(lambda config: _keys(config) + [f"line:{line.name}" for line in config.lines])
+alarms = _of(_alarms)

@@ -25,6 +25,7 @@ def control(
     if without_gateway:
         from gateway.cli.line import direct
 
+        direct.alone(plant)
         print(direct.run(direct.control(plant, device, command, argument)).answer)
         return
     with connected(plant, err.print) as client:

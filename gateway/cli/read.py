@@ -33,6 +33,7 @@ def read(
         from gateway.cli.line import direct
 
         chosen = [tag for key, tag in by_key.items() if matches(key, wanted)]
+        direct.alone(plant)
         samples = direct.run(direct.read(plant, chosen))
         rows = [row_of(sample) for sample in samples]
         for failure in dict.fromkeys(f"{s.tag.device}: {s.detail}" for s in samples if s.detail):

@@ -39,7 +39,7 @@ def status(
     as_json: AsJson = False,
 ) -> None:
     """Print lines, devices, history and what is wrong, from the running gateway."""
-    with reached(config, err.print) as client:
+    with reached(config, err.print, waits=watch and not as_json) as client:
         if watch and not as_json:
             repeated(lambda: view(client.documents(), client.outcomes(HOUR)))
             return

@@ -23,7 +23,7 @@ def watch(
     wanted, by_key = wanted_keys(plant, tags), tags_by_key(plant)
     live = out.is_terminal and not as_json
     tell = out.print if live else err.print  # above the table
-    with connected(plant, tell) as client, suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), connected(plant, tell, waits=True) as client:
         if live:
             show_live(out, client.follow(wanted), by_key, utc=utc)
         else:

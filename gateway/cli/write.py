@@ -126,6 +126,7 @@ def _write(
             return client.requests.write(target, by_name)
     from gateway.cli.line import direct
 
+    direct.alone(config)
     started = time.monotonic()
     try:
         ends = direct.run(direct.write_group(config, [*values.items()]))

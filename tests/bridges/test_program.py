@@ -78,6 +78,29 @@ def test_a_bridge_ends_whatever_stands_still(how: str, said: str, by: signal.Sig
         assert bridge.has_said("most recent call first")
 
 
+WAITS = """
+import asyncio, time
+from gateway import ending
+
+async def command():
+    stop = ending.stop_event()
+    print("ready", flush=True)
+    await stop.wait()
+    await asyncio.to_thread(time.sleep, 300)
+
+ending.WITHIN = 0.5
+asyncio.run(command())
+"""
+
+
+def test_a_command_ends_whatever_stands_still() -> None:
+    """`simulate`, `replay --serve`, `bench` and `ca serve` end by this event."""
+    with Program(sys.executable, "-c", WAITS) as command:
+        command.says("ready")
+        assert command.end(signal.SIGTERM) == 1
+        assert command.has_said("not ended 0.5 s after the signal: ")
+
+
 async def test_a_bridge_whose_first_router_is_dead_uses_the_next_one() -> None:
     dead, alive = free_endpoint(), free_endpoint()
     with PlayedGateway(alive, {}):

@@ -78,3 +78,12 @@ def test_direct_does_not_wait_for_a_broadcast_device(tmp_path: Path) -> None:
     write = plc_gateway("write", path, "all/stop", "true", "--direct")
     assert write.code == 0
     assert "broadcast, without acknowledgement" in write.out
+
+
+@pytest.mark.parametrize("command", [("read",), ("write", "mixer/trim", "1")])
+def test_direct_is_refused_beside_the_gateway(running: Path, command: tuple[str, ...]) -> None:
+    """A device server would take both connections: two masters on one wire."""
+    name, *more = command
+    done = plc_gateway(name, running, *more, "--direct")
+    assert (done.code, done.out) == (1, "")
+    assert done.err == "the gateway of this file runs, and has the ports: leave out --direct\n"

@@ -69,6 +69,7 @@ def test_every_command_has_examples() -> None:
         ("control FILE mi", ["mixer"]),
         ("trace FILE hall-1", ["hall-1"]),
         ("alarms FILE --ack line:hall-1", ["line:hall-1"]),
+        ("alarms FILE --shelve mixer", ["mixer", "mixer/level"]),
         ("read nothing.yaml mixer/s", []),
     ],
 )
@@ -161,7 +162,7 @@ def test_the_version_is_an_option_and_a_command(command: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["read"], ["write", "mixer/trim", "1"], ["watch"], ["status"], ["health"]]
+    "arguments", [["read"], ["write", "mixer/trim", "1"], ["status"], ["health"]]
 )
 def test_without_a_gateway_commands_end_with_1(
     command: Command, config: Path, arguments: list[str]

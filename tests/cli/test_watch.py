@@ -64,6 +64,16 @@ def test_watch_ends_with_its_reader(running: Path) -> None:
     assert done.stderr == ""
 
 
+def test_watch_waits_for_a_gateway_that_starts_later(tmp_path: Path) -> None:
+    """As in two terminals: `make run`, and at the same moment the command that it names."""
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+    with gateway("watch", path, "--json") as watch:
+        watch.says("waiting for it")
+        with started(path):
+            watch.says('"quality": "good"')
+
+
 def test_watch_shows_bad_values_while_the_gateway_is_down(tmp_path: Path) -> None:
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)

@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+import socket
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -14,9 +15,9 @@ from gateway.cli.bench.api import BenchApi, Entry
 from gateway.cli.config.demo import free_port
 from gateway.cli.config.new import LISTEN
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
-from gateway.cli.line.simulate import stop_event
 from gateway.config.sheets.grid import MOST_BYTES
-from gateway.errors import ConfigError, GatewayError
+from gateway.ending import stop_event
+from gateway.errors import ConfigError
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.guard import Guard
 from gateway.parts.web.languages import catalogue_route
@@ -44,19 +45,24 @@ def bench(
     """
     if not file.resolve().parent.is_dir():
         raise ConfigError(f"there is no folder {file.parent}")
+    try:
+        socket.create_server((_HOST, at)).close()
+    except OSError as error:
+        raise ConfigError(f"--at {at}: {error.strerror}") from None
     set_up(LogFormat.TEXT, LogLevel.ERROR)
     asyncio.run(_run(BenchApi(file, _free_endpoint()), at))
 
 
 async def _run(api: BenchApi, at: int) -> None:
-    stop = stop_event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, stop.set)  # its terminal has gone
+    stop = stop_event(signal.SIGHUP)  # its terminal has gone
     serving = asyncio.create_task(serve(api, at, partial(print, flush=True)))
     stopping = asyncio.create_task(stop.wait())
-    await asyncio.wait([serving, stopping], return_when=asyncio.FIRST_COMPLETED)
+    done, _ = await asyncio.wait([serving, stopping], return_when=asyncio.FIRST_COMPLETED)
     for task in (serving, stopping):
         task.cancel()
     await asyncio.gather(serving, stopping, return_exceptions=True)
+    for task in done:
+        task.result()
 
 
 async def serve(api: BenchApi, at: int, tell: Callable[[str], None]) -> None:
@@ -81,7 +87,7 @@ async def serve(api: BenchApi, at: int, tell: Callable[[str], None]) -> None:
     try:
         await asyncio.wait([port, serving], return_when=asyncio.FIRST_COMPLETED)
         if api.draft.file is not None:
-            with suppress(GatewayError):
+            with suppress(ConfigError):  # the page shows the mistakes
                 await api.running.look(api.draft.config())
         entry.begin()
         await serving

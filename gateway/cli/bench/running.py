@@ -10,7 +10,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gateway.cli.client import Client, connected
+from gateway.cli.client import Client, NoGateway, connected
 from gateway.cli.run import STARTED
 from gateway.config import Config
 from gateway.config.changes import needs_restart
@@ -21,7 +21,7 @@ T = TypeVar("T")
 _LOGGED = 40  # lines
 _AGAIN = 0.2  # seconds between two looks
 _READY_WITHIN = 60.0  # seconds
-_ENDS_WITHIN = 10.0
+_ENDS_WITHIN = 5.0  # less than the bench itself has
 _DIES_WITH_PARENT = 1  # of prctl
 
 
@@ -49,8 +49,9 @@ class Running:
         return "" if self._client is None or self._process is not None else "other"
 
     async def look(self, config: Config) -> None:
-        """Looks for a gateway of the file that runs already."""
-        with suppress(GatewayError):
+        """Looks for a gateway of the file that runs already. Raises `GatewayError` for one that
+        stands still, or refuses this user: it has the ports."""
+        with suppress(NoGateway):
             await self._connect(config)
 
     async def take(self, config: Config) -> None:

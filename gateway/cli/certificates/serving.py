@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field, ValidationError
 
 from gateway.cli.certificates.authority import REVOKED, SERVER, Authority
 from gateway.cli.certificates.state import read, sweep
-from gateway.cli.line.simulate import stop_event
 from gateway.config.settings.parsers import web_address
+from gateway.ending import stop_event
 from gateway.errors import ConfigError, GatewayError, NotAllowed
 from gateway.parts.web.connections import Connections, client_of
 from gateway.parts.web.guard import Guard

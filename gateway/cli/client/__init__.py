@@ -7,6 +7,6 @@ from gateway.cli.client.arguments import (
     tags_by_key,
     wanted_keys,
 )
-from gateway.cli.client.client import Client
+from gateway.cli.client.client import Client, NoGateway
 from gateway.cli.client.connection import connected, reached
 from gateway.cli.client.rows import TagRow

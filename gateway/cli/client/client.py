@@ -29,6 +29,10 @@ CHANGED = "does the gateway run with the current version of this file?"
 _LONGEST_LIST = 10  # tags in one sentence
 
 
+class NoGateway(GatewayError):
+    """The gateway of a file does not run, or cannot be reached: it has no port open."""
+
+
 class Client:
     """One session to the gateway of a configuration. Blocking calls, for the command line only.
 
@@ -100,7 +104,7 @@ class Client:
         for reply in self._query(self._keys.status(path)):
             if reply.ok is not None:
                 return document(reply.ok.payload.to_bytes())
-        raise GatewayError(self.no_reply)
+        raise NoGateway(self.no_reply)
 
     def documents(self) -> dict[str, dict[str, Any]]:
         """Returns all status documents by path: `status`, `lines/<line>`, `devices/<device>`."""
@@ -111,7 +115,7 @@ class Client:
             if reply.ok is not None
         }
         if "status" not in found:
-            raise GatewayError(self.no_reply)
+            raise NoGateway(self.no_reply)
         return found
 
     def of(self, gateway: str) -> "Client":
@@ -159,8 +163,8 @@ class Client:
         """Yields the current values, then every change, without end.
 
         When the gateway ends, all values become bad: `no-gateway`. When it returns, or another
-        member of its standby group becomes active, the client queries the values again. Raises
-        `GatewayError` when no gateway replies at the start.
+        member of its standby group becomes active, the client queries the values again. Without
+        one at the start it waits.
         """
         news: SimpleQueue[TagRow | bool] = SimpleQueue()
         with ExitStack() as stack:
@@ -169,11 +173,12 @@ class Client:
             for watcher in self._watchers(news.put):
                 stack.enter_context(watcher)
             rows = self._all(wanted)
-            if not rows:
-                raise GatewayError(self.no_reply)
-            self.report_missing(wanted, rows)
+            if rows:
+                self.report_missing(wanted, rows)
+            else:
+                self._tell(f"{self.no_reply} This command waits for it")
             known: set[str] = set()  # tags with a value now
-            present = True
+            present = bool(rows)
             while True:
                 known.update(row.tag for row in rows)
                 yield from rows

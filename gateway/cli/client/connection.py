@@ -2,16 +2,18 @@
 
 import json
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import zenoh
 
 from gateway import config as configuration
-from gateway.cli.client.client import Client
+from gateway.cli.client.client import Client, NoGateway
 from gateway.cli.progress import busy
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.gateway_address import address
@@ -34,15 +36,18 @@ _OPEN: dict[str, object] = {
 }
 
 
+AGAIN = 0.5  # seconds between two tries of a command that waits for its gateway
+
+
 @contextmanager
-def reached(path: Path, tell: Callable[[str], None]) -> Iterator[Client]:
+def reached(path: Path, tell: Callable[[str], None], *, waits: bool = False) -> Iterator[Client]:
     """Yields a client of the gateway of a file, and reads only the address in it.
 
     The client has no tags: for status and alarms. Where it fails, the file is checked as a whole,
     because a mistake in it may be the reason. Raises as `load` and `connected`.
     """
     try:
-        with connected(address(path) or configuration.load(path), tell) as client:
+        with connected(address(path) or configuration.load(path), tell, waits=waits) as client:
             yield client
     except GatewayError:
         configuration.load(path)
@@ -50,30 +55,56 @@ def reached(path: Path, tell: Callable[[str], None]) -> Iterator[Client]:
 
 
 @contextmanager
-def connected(config: "Config | GatewayAddress", tell: Callable[[str], None]) -> Iterator[Client]:
+def connected(
+    config: "Config | GatewayAddress", tell: Callable[[str], None], *, waits: bool = False
+) -> Iterator[Client]:
     """Yields a client of the gateway that `config` describes. `tell` gets sentences for people.
 
     The client uses the user of the environment variables, or else the gateway's own. Raises
-    `GatewayError` when no gateway is reachable or it refuses the user.
+    `NoGateway` when no gateway is reachable, unless it `waits`, and `GatewayError` when the gateway
+    stands still or refuses the user.
     """
     endpoints = _endpoints(config)
     if not endpoints:
-        raise GatewayError("zenoh.listen and zenoh.connect are empty: no gateway can be reached")
+        raise NoGateway("zenoh.listen and zenoh.connect are empty: no gateway can be reached")
     setup = _setup(config.zenoh, endpoints)
     user = json.loads(setup.get_json(_USER))
-    try:
-        with busy(f"connecting to {endpoints[0]}"):
-            session = zenoh.open(setup)
-    except zenoh.ZError:
-        from gateway.cli.client.diagnosis import connection_failure  # its TLS takes 10 ms
-
-        hint = f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}"
-        raise GatewayError(connection_failure(setup, endpoints, user, hint)) from None
+    opened = partial(_opened, setup, endpoints, user)
+    session = _awaited(opened, tell) if waits else opened()
     try:
         yield Client(session, config, tell, user)
     finally:
         with suppress(zenoh.ZError):  # may time out when the gateway hangs
             session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+
+
+def _awaited(opened: Callable[[], zenoh.Session], tell: Callable[[str], None]) -> zenoh.Session:
+    said = False
+    while True:
+        try:
+            return opened()
+        except NoGateway as error:
+            if not said:
+                tell(f"{error}; waiting for it")
+                said = True
+        time.sleep(AGAIN)
+
+
+def _opened(setup: zenoh.Config, endpoints: tuple[str, ...], user: str | None) -> zenoh.Session:
+    """Raises `NoGateway`, `GatewayError`."""
+    try:
+        with busy(f"connecting to {endpoints[0]}"):
+            return zenoh.open(setup)
+    except zenoh.ZError:
+        from gateway.cli.client.diagnosis import connection_failure  # its TLS takes 10 ms
+
+        hint = f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}"
+        if why := connection_failure(setup, endpoints, user, hint):
+            raise GatewayError(why) from None
+        raise NoGateway(
+            f"no gateway at {', '.join(endpoints)}: start it with `plc-gateway run`, or use "
+            "--direct"
+        ) from None
 
 
 def _endpoints(config: "Config | GatewayAddress") -> tuple[str, ...]:

@@ -17,7 +17,7 @@ _TLS = "transport/link/tls"
 def connection_failure(
     setup: zenoh.Config, endpoints: Sequence[str], user: str | None, hint: str
 ) -> str:
-    """Returns a sentence for each endpoint that accepts connections, or one if none does.
+    """Returns a sentence for each endpoint that accepts connections; empty if none does.
 
     `hint` explains how to give a user name, for a client without one (`user` is None).
     """
@@ -29,9 +29,7 @@ def connection_failure(
         for endpoint in endpoints
         if (fault := _fault(endpoint, setup)) is not None
     ]
-    if sentences:
-        return "; ".join(sentences)
-    return f"no gateway at {', '.join(endpoints)}: start it with `plc-gateway run`, or use --direct"
+    return "; ".join(sentences)
 
 
 def _fault(endpoint: str, setup: zenoh.Config) -> str | None:

@@ -11,7 +11,9 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from typing import Any, TypeVar
 
+from gateway.cli.client import NoGateway, connected
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
+from gateway.cli.terminal import err
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
 from gateway.engine.device.device import Device
@@ -48,6 +50,13 @@ class _Once:
 
     def online(self, device: Device, online: bool) -> None:
         """The samples say all that counts here."""
+
+
+def alone(config: Config) -> None:
+    """Raises `GatewayError` while the gateway of the file runs: a wire has one master."""
+    with suppress(NoGateway), connected(config, err.print) as client:
+        client.status()
+        raise GatewayError("the gateway of this file runs, and has the ports: leave out --direct")
 
 
 def run(talk: Coroutine[Any, Any, T]) -> T:

@@ -14,7 +14,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from gateway.cli.client import Client, connected
+from gateway.cli.client import Client, NoGateway, connected
 from gateway.cli.line import direct
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.peek_table import Cell, change_text, table_of
@@ -103,7 +103,7 @@ def _gateway(config: Path | None) -> Iterator[Client | None]:
             found = None
             if config is not None:
                 found = stack.enter_context(connected(loaded(config), err.print))
-        except GatewayError:
+        except NoGateway:
             found = None
         yield found
 

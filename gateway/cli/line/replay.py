@@ -14,10 +14,11 @@ from gateway.cli.line.capture import Capture
 from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.peek import SettingOption
 from gateway.cli.line.recorded_line import Log, line_of_file, line_of_protocols
-from gateway.cli.line.simulate import stop_event, tcp_address
+from gateway.cli.line.simulate import tcp_address
 from gateway.cli.terminal import FAILED, printable
 from gateway.cli.trace import clock
 from gateway.config import LineConfig
+from gateway.ending import stop_event
 from gateway.errors import ConfigError, GatewayError
 from gateway.line.exchanges import shown
 from gateway.parts.recording.replay import Difference, Learned, Replay, courses, of_units, timed

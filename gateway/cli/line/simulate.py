@@ -1,7 +1,6 @@
 """The `simulate` command: serves the configured devices as simulated PLCs."""
 
 import asyncio
-import signal
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from functools import partial
@@ -14,6 +13,7 @@ from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.progress import loaded
 from gateway.cli.terminal import ConfigPath
 from gateway.config import Config, LineConfig
+from gateway.ending import stop_event
 from gateway.errors import ConfigError
 from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.simulator.plant import station_for
@@ -58,15 +58,6 @@ async def serve(
             say(f"line {line.name}: stations {stations} at {served.address}")
         say("A line that reads them needs `origin: simulated`. Ctrl-C ends it.")
         await stop.wait()
-
-
-def stop_event() -> asyncio.Event:
-    """Returns an event that SIGTERM and SIGINT set."""
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
-    return stop
 
 
 async def _serve(line: LineConfig, place: tuple[str, int] | None, links: Path | None) -> Served:
