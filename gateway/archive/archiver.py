@@ -17,7 +17,8 @@ import zenoh
 
 from gateway.archive.pages import History, Page, file_of
 from gateway.archive.rows import Row, rfc3339
-from gateway.archive.store import Cursor, Gap, Overtaken, Store, StoreDown, store_at
+from gateway.archive.store import Cursor, Gap, Overtaken, Store, StoreDown
+from gateway.archive.stores import store_at
 from gateway.archive.turn import Turn, group_of
 from gateway.bridges.program import Gateways, opened, say
 from gateway.errors import GatewayError

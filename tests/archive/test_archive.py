@@ -17,7 +17,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import dataset, fs
 
-from gateway.archive.store import Cursor, store_at
+from gateway.archive.store import Cursor
+from gateway.archive.stores import store_at
 from tests.e2e.processes import (
     Program,
     gateway,

@@ -20,7 +20,8 @@ from gateway.archive.influx import InfluxStore
 from gateway.archive.parquet import ParquetStore
 from gateway.archive.postgres import PostgresStore
 from gateway.archive.rows import Row, rfc3339, row_of
-from gateway.archive.store import Cursor, Gap, Overtaken, Store, StoreDown, cursor_of, store_at
+from gateway.archive.store import Cursor, Gap, Overtaken, Store, StoreDown, cursor_of
+from gateway.archive.stores import store_at
 from gateway.bridges.documents import document_of
 from gateway.errors import ConfigError
 from tests.archive.servers import Postgres, postgres, s3

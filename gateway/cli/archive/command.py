@@ -12,7 +12,8 @@ from rich.text import Text
 
 from gateway.archive.archiver import archive
 from gateway.archive.rows import rfc3339
-from gateway.archive.store import Cursor, store_at
+from gateway.archive.store import Cursor
+from gateway.archive.stores import store_at
 from gateway.bridges.program import Gateways
 from gateway.bridges.program import run as run_program
 from gateway.cli.terminal import ROUTER, AsJson, ZenohFile, out, printable
