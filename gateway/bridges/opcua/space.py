@@ -15,7 +15,7 @@ from asyncua import ua
 from asyncua.server.address_space import AddressSpace, AttributeValue, NodeData
 
 from gateway.bridges.documents import Known
-from gateway.bridges.opcua.attributes import PROPERTIES, Fields, int32, of_tag, properties, variable
+from gateway.bridges.opcua.values import PROPERTIES, Fields, int32, of_tag, properties, variable
 
 Ids, Class = ua.ObjectIds, ua.NodeClass
 Attribute, Type, Level = ua.AttributeIds, ua.VariantType, ua.AccessLevel

@@ -12,8 +12,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.config.modem_plan import modem_plan, modem_warnings
-from gateway.cli.config.served_plan import served_plan
+from gateway.cli.config.line_plans import modem_plan, modem_warnings, served_plan
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder

@@ -12,8 +12,7 @@ from typing import Any
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.settings.model import DeviceSection
 from gateway.config.settings.validate import driver_settings
-from gateway.config.templates.files import Template, Templates
-from gateway.config.templates.places import Expanded, Origin
+from gateway.config.templates.files import Expanded, Origin, Template, Templates
 from gateway.config.templates.text import filled, has_parameter
 from gateway.config.yaml.file import YamlFile
 from gateway.errors import ConfigError

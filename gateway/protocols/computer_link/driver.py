@@ -10,7 +10,17 @@ from typing import ClassVar, Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError, Unclear
 from gateway.protocols.capabilities import ScanHints
-from gateway.protocols.computer_link.access import Access, possible, read_access, write_access
+from gateway.protocols.computer_link.access import (
+    Access,
+    data_characters,
+    decode_all,
+    listed_characters,
+    monitored_access,
+    possible,
+    read_access,
+    scattered_access,
+    write_access,
+)
 from gateway.protocols.computer_link.codec import (
     ALL_STATIONS,
     PC_ON_DEMAND,
@@ -31,13 +41,6 @@ from gateway.protocols.computer_link.replies import (
     model_name,
 )
 from gateway.protocols.computer_link.resync import ResyncKind
-from gateway.protocols.computer_link.scattered import (
-    data_characters,
-    decode_all,
-    listed_characters,
-    monitored_access,
-    scattered_access,
-)
 from gateway.protocols.computer_link.traffic import Read, learn, link_traffic_reader
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import (

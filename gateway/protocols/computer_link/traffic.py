@@ -18,10 +18,9 @@ from gateway.protocols.computer_link.codec import (
 )
 from gateway.protocols.computer_link.devices import Profile, wire_name
 from gateway.protocols.computer_link.requests import HEADER, NEVER, area_length
-from gateway.protocols.delimited import DelimitedTrafficReader
 from gateway.protocols.devices import parse_device
 from gateway.protocols.driver import Span, Unit
-from gateway.protocols.listening import Asked, Learn, Told
+from gateway.protocols.listening import Asked, DelimitedTrafficReader, Learn, Told
 
 _LONGEST = 600
 _PIECES = {"BR": (1, 1), "WR": (4, 8)}  # characters of a point; of a word and of a dword

@@ -7,8 +7,7 @@ A frame does not say its direction. A request to read has another length than it
 from typing import NamedTuple
 
 from gateway.errors import Garbled
-from gateway.protocols.delimited import DelimitedTrafficReader
-from gateway.protocols.listening import Asked, Heard, Noise, Told
+from gateway.protocols.listening import Asked, DelimitedTrafficReader, Heard, Noise, Told
 from gateway.protocols.modbus.ascii import body_of
 from gateway.protocols.modbus.frame import (
     DIAGNOSTICS,

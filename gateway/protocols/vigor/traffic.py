@@ -1,8 +1,7 @@
 """Finds requests and replies of the Vigor computer link in the bytes of a line."""
 
 from gateway.errors import Garbled
-from gateway.protocols.delimited import DelimitedTrafficReader
-from gateway.protocols.listening import Asked, Told
+from gateway.protocols.listening import Asked, DelimitedTrafficReader, Told
 from gateway.protocols.vigor.codec import (
     ACK,
     GOOD,

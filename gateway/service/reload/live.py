@@ -12,9 +12,8 @@ from gateway.northbound.northbound import Northbound
 from gateway.plant.plant import Plant
 from gateway.plant.threads import off_loop
 from gateway.service.bulkheads import Bulkheads
-from gateway.service.reload.lines import RunningLines
 from gateway.service.reload.reloader import Reloader
-from gateway.service.reload.renewal import Renewal
+from gateway.service.reload.renewal import Renewal, RunningLines
 from gateway.service.supervisor import Supervisor
 
 
