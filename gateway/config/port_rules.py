@@ -172,4 +172,5 @@ def direction(line: LineSection, path: Path, mistakes: Mistakes) -> Rs485 | None
         if delay > LONGEST_DELAY or abs(delay * 1e3 - round(delay * 1e3)) > 1e-6:
             text = "Linux waits whole milliseconds, at most 100ms: write 0ms, 1ms, 2ms"
             mistakes.add((*path, "rs485", name), text)
-    return Rs485(own.rts == "send", own.before, own.after, hears_itself=bool(line.echo))
+    by_hand = own.by == "program"
+    return Rs485(own.rts == "send", own.before, own.after, bool(line.echo), by_hand)

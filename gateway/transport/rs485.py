@@ -1,11 +1,14 @@
-"""The direction of an RS-485 transceiver, switched by the kernel (Linux, `TIOCSRS485`).
+"""The direction of an RS-485 transceiver: switched by the kernel (Linux, `TIOCSRS485`), or by hand.
 
 A two-wire transceiver sends or receives. Most adapters switch by themselves; a UART on a board
-often needs RTS for it. The kernel switches within microseconds, which no program does in time.
+often needs RTS for it. The kernel switches within microseconds. A program is later: by hand, each
+switch is measured.
 """
 
+import os
 import struct
 import sys
+import time
 from dataclasses import dataclass
 
 from gateway.errors import LineDown
@@ -25,6 +28,7 @@ class Rs485:
     before: float = 0.0  # from switching to the first bit
     after: float = 0.0  # from the last bit to switching back
     hears_itself: bool = False  # the receiver stays on: the port gets its own requests
+    by_hand: bool = False  # this program switches
 
     def packed(self) -> bytes:
         """Returns the kernel's structure."""
@@ -34,7 +38,7 @@ class Rs485:
 
 
 def set_direction(name: str, port: int, wanted: Rs485) -> None:
-    """Has the kernel switch the transceiver at an open port. Raises `LineDown`.
+    """Has the transceiver receive, and the kernel switch it if it should. Raises `LineDown`.
 
     `port`: a file descriptor. A driver may change what it cannot do; so it is asked afterwards.
     """
@@ -42,6 +46,12 @@ def set_direction(name: str, port: int, wanted: Rs485) -> None:
         raise LineDown(f"{name}: `rs485` needs Linux: use an adapter that switches by itself")
     import fcntl
 
+    if wanted.by_hand:
+        try:
+            _switch(port, on=not wanted.rts_sends)
+        except OSError as error:
+            raise LineDown(f"{name}: its driver has no RTS ({error.strerror})") from error
+        return
     asked = wanted.packed()
     try:
         fcntl.ioctl(port, _SET, asked)
@@ -49,7 +59,7 @@ def set_direction(name: str, port: int, wanted: Rs485) -> None:
     except OSError as error:
         raise LineDown(
             f"{name}: its driver does not switch RS-485 ({error.strerror}): remove `rs485` if the "
-            "adapter switches by itself, or use another adapter"
+            "adapter switches by itself; else write `by: program`, or use another adapter"
         ) from error
     if found[:12] != asked[:12]:
         flags, before, after = struct.unpack_from("=3I", found)
@@ -57,3 +67,37 @@ def set_direction(name: str, port: int, wanted: Rs485) -> None:
             f"{name}: its driver does not switch RS-485 as `rs485` says: it has flags {flags:#x}, "
             f"before {before} ms, after {after} ms"
         )
+
+
+def send_by_hand(port: int, data: bytes, seconds: float, wanted: Rs485) -> float:
+    """Switches to sending, sends, and switches back. Blocks. Raises `OSError`.
+
+    `port`: a file descriptor, which it closes. `seconds`: of the characters on the wire. Returns
+    the seconds from the last bit, on a wire that nothing holds up, to the end of the switch: with
+    `after`, and with what the driver and this computer need.
+    """
+    import termios
+
+    with os.fdopen(port, "wb", 0) as file:
+        try:
+            _switch(port, on=wanted.rts_sends)
+            time.sleep(wanted.before)
+            ends = time.monotonic() + seconds
+            if (taken := file.write(data)) != len(data):
+                raise OSError(f"its driver took {taken or 0} of {len(data)} bytes")
+            # Drivers of adapters say that all is sent when the adapter has it: characters follow.
+            termios.tcdrain(port)
+            time.sleep(max(0.0, ends - time.monotonic()) + wanted.after)
+        except termios.error as error:
+            raise OSError(*error.args) from error
+        finally:
+            _switch(port, on=not wanted.rts_sends)
+        return time.monotonic() - ends
+
+
+def _switch(port: int, *, on: bool) -> None:
+    import fcntl
+    import termios
+
+    rts = struct.pack("=i", termios.TIOCM_RTS)
+    fcntl.ioctl(port, termios.TIOCMBIS if on else termios.TIOCMBIC, rts)

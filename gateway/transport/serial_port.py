@@ -7,14 +7,16 @@ import sys
 from pathlib import Path
 
 import serialx
+import structlog
 
 from gateway.errors import LineDown
 from gateway.transport.os_errors import line_down
-from gateway.transport.port import Port, Receiver, SerialPath, SerialSettings
-from gateway.transport.rs485 import set_direction
+from gateway.transport.port import Receiver, SerialPath, SerialSettings
+from gateway.transport.rs485 import Rs485, send_by_hand, set_direction
 from gateway.transport.stream import StreamPort
 from gateway.transport.telnet import PARITIES, Control, Setting
 
+log = structlog.get_logger("gateway.line")
 _SENTENCES = {
     errno.ENOENT: "no such port",
     errno.ENODEV: "no such port",
@@ -26,17 +28,23 @@ _SENTENCES = {
     errno.EPERM: "permission denied: is the user in group dialout?",
     errno.EINVAL: "does not support this baud rate and format",
 }
+# Characters after which a quick station may reply: its first ones are lost from then on.
+TARDY = 3.5
 _PTYS = range(136, 144)  # Linux' major device numbers of pseudo terminals
 
 
 async def open_serial(
     where: SerialPath, settings: SerialSettings, receiver: Receiver, *, timeout: float = 5.0
-) -> Port:
+) -> "SerialPort":
     """Opens and locks a serial port of this computer. Raises `LineDown`.
 
     Bytes that the system received before are discarded.
     """
-    port = SerialPort(where.path, receiver, settings)
+    rs485 = settings.rs485
+    if rs485 is not None and rs485.by_hand:
+        port: SerialPort = SwitchedPort(where.path, receiver, settings, rs485)
+    else:
+        port = SerialPort(where.path, receiver, settings)
     data_bits, parity, stop_bits = tuple(settings.format)
     port.is_pty = await asyncio.to_thread(_is_pty, where.path)
     if port.is_pty:
@@ -53,8 +61,8 @@ async def open_serial(
                 stopbits=serialx.StopBits(int(stop_bits)),
                 exclusive=True,
             )
-        if settings.rs485 is not None:
-            set_direction(where.path, port.descriptor(), settings.rs485)
+        if rs485 is not None:
+            set_direction(where.path, port.descriptor(), rs485)
         port.ready()
     # ValueError: an invalid path (with a NUL), a format unknown to serialx.
     except (OSError, serialx.SerialException, ValueError, LineDown) as error:
@@ -116,6 +124,41 @@ class SerialPort(StreamPort):
             case _ if value >= Control.INBOUND_FLOW:
                 return Control.NO_INBOUND_FLOW
         return value
+
+
+class SwitchedPort(SerialPort):
+    """An open serial port whose RS-485 direction this program switches."""
+
+    def __init__(
+        self, name: str, receiver: Receiver, settings: SerialSettings, wanted: Rs485
+    ) -> None:
+        super().__init__(name, receiver, settings)
+        self._wanted = wanted
+        data_bits, parity, stop_bits = tuple(settings.format)
+        self._character = (
+            1 + int(data_bits) + (parity != "N") + int(stop_bits)
+        ) / settings.baudrate
+        self._sending: asyncio.Task[None] | None = None
+        self._latest = TARDY * self._character  # seconds of the latest switch that was logged
+
+    def write(self, data: bytes) -> None:
+        self._allowance.requested()
+        port = os.dup(self.descriptor())  # no other port gets its number while a thread has it
+        loop = asyncio.get_running_loop()
+        self._sending = loop.create_task(self._send(port, data, self._sending))
+
+    async def _send(self, port: int, data: bytes, before: asyncio.Task[None] | None) -> None:
+        seconds = len(data) * self._character
+        try:
+            if before is not None:
+                await before
+            late = await asyncio.to_thread(send_by_hand, port, data, seconds, self._wanted)
+        except OSError as error:
+            self.break_off(f"cannot send: {error.strerror or error}")
+            return
+        if late - self._wanted.after > self._latest:
+            self._latest = 2 * (late - self._wanted.after)
+            log.warning("direction switched late", port=self.name, seconds=round(late, 4))
 
 
 def _send_break(port: int) -> None:

@@ -47,6 +47,10 @@ def check(
     expand: Annotated[
         bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
     ] = False,
+    port: Annotated[
+        bool,
+        typer.Option("--port", help="Open serial ports and say what drivers take; send nothing."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
@@ -64,6 +68,11 @@ def check(
     warnings += [text for one in lines for text in modem_warnings(by_name[one.name], one)]
     warnings = [*(line.advice() for line in lines if line.overloaded), *warnings]
     notes, errors = [*_notes(loaded)], [*_unwritable(loaded)]
+    if port:
+        from gateway.cli.config.port_check import port_sentences  # it loads serialx
+
+        good, bad = port_sentences(loaded.lines)
+        notes, errors = [*good, *notes], [*bad, *errors]
     if as_json:
         found = {"notes": notes, "warnings": warnings, "errors": errors}
         print(json.dumps({"file": str(config), "lines": [*map(_document, lines)], **found}))

@@ -79,8 +79,10 @@ class DeviceSection(Section):
 
 
 class Rs485Section(Section):
-    """An RS-485 transceiver that RTS switches between sending and receiving: Linux does it."""
+    """An RS-485 transceiver that RTS switches between sending and receiving."""
 
+    by: Literal["kernel", "program"] = "kernel"
+    """The kernel switches within microseconds; the gateway where the driver cannot."""
     rts: Literal["send", "receive"] = "send"
     """RTS is on while the port sends, or while it receives."""
     before: Duration = 0.0
