@@ -45,15 +45,16 @@ def rules_of(line: LineState) -> Sequence[Rule]:
     devices, effects = line.devices, line.effects
     if listens(devices):
         return (Listening(devices, line.wire, line.health, effects),)
+    silence = LineSilence(line.schedule, devices, line.in_flight)
     return (
-        LineSilence(line.schedule, devices, line.in_flight),
+        silence,
         ShorterSilences(line.name, devices, line.in_flight, effects),
         Pipelining(line.in_flight, effects),
         BusyDevices(),
         BroadcastReplies(devices),
         BitWrites(),
         Identities(devices, line.schedule, line.in_flight, effects),
-        Stray(line.name, devices, line.health, effects),
+        Stray(line.name, devices, line.health, effects, silence.heard),
         RequestExpiry(line.schedule.requests, effects),
         line.staleness,
         UnsolicitedFrames(devices, line.health, effects),

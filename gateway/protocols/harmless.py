@@ -11,8 +11,8 @@ from functools import lru_cache
 from gateway.errors import Refused
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span
 
-MOST_UNITS, MOST_FORMS = 64, 6  # of one read; of the reads in one place
-PROOF_FORM = 9  # the form that resyncs do not use otherwise
+MOST_UNITS, MOST_FORMS = 64, 5  # of one read; of the reads in one place
+PROOF_FORM = 7  # the first form that no resync has: they have five beside the outstanding one
 MOST_EARLIER = 16  # resyncs before this one
 # The form of the reply to a read, such as its number of bytes; None: it cannot be read.
 FormOf = Callable[[Span], Hashable | None]
@@ -109,7 +109,7 @@ def _place(form: FormOf, span: Span, late: Hashable) -> tuple[Sequence[Span], Se
         for found, at in ((begin, start), (end, start + size - units)):
             read = Span(area, at, units)
             shape = form(read)
-            if shape is not None and shape != late:
+            if shape is not None and shape != late and len(found) < MOST_FORMS:
                 found.setdefault(shape, read)
         if len(begin) == MOST_FORMS:
             break

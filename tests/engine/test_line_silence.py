@@ -1,13 +1,17 @@
 """A line on which no station replies any more is opened again, at growing times."""
 
+from collections.abc import Callable
 from dataclasses import replace
+
+import pytest
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Reopen, Resynced, Sent, Settle, Settled
 from gateway.engine.jobs.requests import Write
 from gateway.engine.results.line_silence import FIRST, LONGEST
 from gateway.errors import Evidence, Garbled, Refused
-from tests.engine.rig import LOST, SILENCE, Rig, broadcast_device, link_device
+from gateway.protocols.computer_link.codec import LinkCodec, Text
+from tests.engine.rig import LOST, SILENCE, Rig, broadcast_device, link_device, tcp_device
 from tests.sim.bench import WIRE
 from tests.sim.plant import words
 
@@ -131,6 +135,33 @@ def test_bytes_count_as_life_only_where_a_device_sends_by_itself() -> None:
         else:
             rig.fail(job)
     assert isinstance(job, Reopen)
+
+
+@pytest.mark.parametrize(
+    ("rig", "late"),
+    [
+        (lambda: Rig(link_device()), LinkCodec().encode(Text(1, "0000"))),
+        (lambda: Rig(tcp_device()), bytes.fromhex("0007 0000 0003 01 83 0B")),
+    ],
+    ids=["computer-link", "modbus-tcp"],
+)
+def test_late_frames_outside_of_a_transaction_keep_the_port_open(
+    rig: Callable[[], Rig], late: bytes
+) -> None:
+    """A server that works through its queue replies, although each reply is too late."""
+    for arrives in (True, False):
+        each, last = rig(), 0.0
+        while not isinstance(job := each.next(), Reopen) and each.now < 200.0:
+            if isinstance(job, Idle):
+                each.now = job.until
+                if arrives and each.now >= last + 3.0:
+                    last = each.now
+                    each.note(each.engine.received(late, each.now, each.time))
+            elif isinstance(job, Settle):
+                each.conclude(job, Settled(None))
+            else:
+                each.fail(job)
+        assert isinstance(job, Reopen) is not arrives
 
 
 def test_a_broadcast_that_was_sent_is_no_sign_of_life() -> None:

@@ -68,7 +68,7 @@ class LineSilence(Rule):
         """Takes the result of a job: any reply is a sign of life, a broadcast has none."""
         match result:
             case Unsteady() | Refused():
-                self._heard()
+                self.heard()
             case DeviceError() if traffic.sent and not job.device.broadcast:
                 self._unanswered(result)
             case DeviceError() | LineDown() | BadValue() | Busy() | None:
@@ -76,7 +76,7 @@ class LineSilence(Rule):
             case Settled(late=None) | Sent(acknowledged=False):
                 pass
             case _:
-                self._heard()
+                self.heard()
 
     def _unanswered(self, error: DeviceError) -> None:
         """Notes a transaction whose requests got no reply."""
@@ -88,20 +88,20 @@ class LineSilence(Rule):
                 self._requests += 1
                 self._begun = min(self._begun, self._in_flight.begun)
             case _:
-                self._heard()
+                self.heard()
 
     def received(self, data: bytes, now: float, time: int) -> None:
         """Takes bytes of a device that sends unsolicited frames."""
         if self._noted and any(speaks(device) for device in self._devices):
-            self._heard()
+            self.heard()
 
     def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
         """Takes a frame that is no reply."""
         if not echo:
-            self._heard()
+            self.heard()
 
-    def _heard(self) -> None:
-        """Notes a reply, or another frame."""
+    def heard(self) -> None:
+        """Notes a reply, or another frame, also one that arrives too late for its request."""
         if self._noted:
             self._noted = False
             self._requests, self._begun, self._limit = 0, NEVER, 0.0

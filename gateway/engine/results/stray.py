@@ -1,6 +1,6 @@
 """Stray frames: counted, explained in the log by the driver, and taken as extra replies."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
 from gateway.engine.device.changes import Changes
@@ -25,12 +25,19 @@ class Stray(Rule):
     """
 
     def __init__(
-        self, line: str, devices: Sequence[Device], results: HealthRules, effects: Effects
+        self,
+        line: str,
+        devices: Sequence[Device],
+        results: HealthRules,
+        effects: Effects,
+        replied: Callable[[], None] = lambda: None,
     ) -> None:
+        """`replied` is called for each reply that arrives outside of a transaction."""
         self._line = line
         self._devices = devices
         self._results = results
         self._effects = effects
+        self._replied = replied
         self._readers = _readers(devices)
         self._codecs: dict[object, Codec[Any]] = {}
         self._last = float("-inf")
@@ -60,7 +67,10 @@ class Stray(Rule):
                 device.record.count_stray(len(own))
                 self._log_frames(device, own, now)
                 self._count_older(device, own, now)
-                if any(_is_extra_reply(device, frame) for frame in own):
+                extra = any(_is_extra_reply(device, frame) for frame in own)
+                if extra or (own and device.driver.traits.over_network):
+                    self._replied()
+                if extra:
                     self._results.spoke(device, now)
                     self._results.answered_twice(device, now, time)
 
