@@ -199,6 +199,7 @@ class Bulkheads:
         self._plant = plant
         self._all: list[Bulkhead] = []
         self._followers: Sequence[tuple[Bulkhead, Follows]] = ()
+        self._auditors: Sequence[tuple[Bulkhead, Audits]] = ()
         self._active = False
         plant.doors.retagged = self._retag
         plant.doors.documents.append(self.documents)
@@ -219,7 +220,10 @@ class Bulkheads:
     # -- for Zenoh and other parts --
 
     def each(self, capability: type[Any]) -> Sequence[Any]:
-        return [one.part for one in self._all if isinstance(one.part, capability)]
+        return [part for _, part in self._having(capability)]
+
+    def _having(self, capability: type[Any]) -> list[tuple[Bulkhead, Any]]:
+        return [(one, one.part) for one in self._all if isinstance(one.part, capability)]
 
     def has_keys(self, part: str) -> bool:
         return any(
@@ -242,10 +246,9 @@ class Bulkheads:
         return None
 
     def audit(self, at: int, event: str) -> None:
-        for one in self._all:
-            if isinstance(one.part, Audits):
-                with one:
-                    one.part.audit(at, event)
+        for one, part in self._auditors:
+            with one:
+                part.audit(at, event)
 
     async def publish_all(self) -> None:
         for one in self._all:
@@ -253,10 +256,9 @@ class Bulkheads:
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         found: dict[str, Mapping[str, object]] = {}
-        for one in self._all:
-            if isinstance(one.part, Documented):
-                with one:
-                    found |= one.part.documents()
+        for one, part in self._having(Documented):
+            with one:
+                found |= part.documents()
         for one in self._all:
             if one.part is not None or one.why:
                 found[f"parts/{one.name}"] = one.document()
@@ -275,29 +277,23 @@ class Bulkheads:
                 part.set_online(device, online)
 
     def _retag(self, tags: Sequence[Tag], gone: Sequence[Tag]) -> None:
-        for one in self._all:
-            if isinstance(one.part, Retags):
-                with one:
-                    one.part.retag(tags, gone)
+        for one, part in self._having(Retags):
+            with one:
+                part.retag(tags, gone)
         self._changed()
 
     def _changed(self) -> None:
-        """Notes which parts see samples now."""
-        followers = list[tuple[Bulkhead, Follows]]()
-        for one in self._all:
-            if isinstance(one.part, Follows):
-                followers.append((one, one.part))
-        self._followers = followers
+        """Notes which parts see samples and writes now."""
+        self._followers, self._auditors = self._having(Follows), self._having(Audits)
         self._plant.doors.stores[:] = self.each(Stores)
         self._plant.doors.logs[:] = [part.wire_logs for part in self.each(Logged)]
         for one in self._all:
             one.activate(active=self._active)
         seers = list[Callable[[Sequence[Sample]], None]]()
-        for one in self._all:
-            if isinstance(one.part, Sees):
-                with one:
-                    if one.part.wants:
-                        seers.append(_guarded(one, one.part.seen))
+        for one, part in self._having(Sees):
+            with one:
+                if part.wants:
+                    seers.append(_guarded(one, part.seen))
         self._plant.doors.seers = seers
 
     # -- life --
