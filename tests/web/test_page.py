@@ -69,9 +69,9 @@ def oven() -> PlainPlant:
     return plant
 
 
-async def sign_in(tab: Tab) -> None:
+async def sign_in(tab: Tab, token: str = TOKEN) -> None:
     await tab.until('document.getElementById("sign-in").open')
-    for name, value in (("token", TOKEN), ("by", "Ana")):
+    for name, value in (("token", token), ("by", "Ana")):
         await tab.value(f'document.getElementById("{name}").value = "{value}"')
     await tab.value('document.getElementById("token-form").requestSubmit()')
     await tab.until('!document.getElementById("sign-in").open')
@@ -206,6 +206,39 @@ async def test_a_wrong_token_is_said_and_not_kept(tab: Tab, tokens: Path) -> Non
         assert await tab.value('sessionStorage.getItem("token")') is None
         await sign_in(tab)
         await tab.until(f"{text('#account')} === 'alice: sign out'")
+
+
+async def test_a_token_that_is_withdrawn_is_asked_for_again(tab: Tab, tokens: Path) -> None:
+    async with serving(plant=oven(), tokens_file=tokens) as client:
+        client.north.endings[b"90"] = WriteResult(90, 0, 0.03, verified=True)
+        await opened(tab, client, "tags")
+        await tab.click('#space button[aria-label="write oven/setpoint"]')
+        await sign_in(tab)
+        await tab.until("document.activeElement.closest('.editor')")
+        await tab.type("90")
+        tokens.write_text(tokens.read_text().replace(TOKEN, TOKEN[::-1]))
+        await tab.until(f"{text('#account')} === 'Sign in' && !sessionStorage.getItem('token')")
+        await tab.press("Enter")
+        await tab.until('document.getElementById("sign-in").open')
+        assert client.north.written == []
+        await sign_in(tab, TOKEN[::-1])
+        await tab.until(f"{text('.editor button.main')} === 'Confirm: 90 °C'")
+        await tab.click(".editor button.main")
+        await tab.until(f"{text('.editor .result')} === '90 °C: acknowledged and read back'")
+
+
+async def test_a_tab_that_is_not_seen_leaves_its_connection_to_others(tab: Tab) -> None:
+    async with serving(plant=oven()) as client:
+        await opened(tab, client)
+        await tab.until(f"{texts('.tile .value')}[0] === '91.5 °C'")
+        change = "document.dispatchEvent(new Event('visibilitychange'))"
+        for hidden in ("true", "false"):
+            how = f"{{value: {hidden}, configurable: true}}"
+            await tab.value(f"Object.defineProperty(document, 'hidden', {how}); {change}")
+            if hidden == "true":
+                assert await tab.value('document.body.className === "stale"')
+                client.plant.now("oven/temperature", 12.0)
+        await tab.until(f"{LIVE} && {texts('.tile .value')}[0] === '12.0 °C'")
 
 
 async def test_a_page_for_other_machines_asks_for_the_token(tab: Tab, tokens: Path) -> None:

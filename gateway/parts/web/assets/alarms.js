@@ -179,6 +179,7 @@ async function order({ alarm }, fields, done) {
 async function acknowledge(...alarms) {
   if (!(await signedIn())) return;
   let done = 0;
+  let by = "";
   const wrong = [];
   for (const { alarm, raised } of alarms) {
     put("acknowledge-result", t("acknowledging {alarm} …", { alarm }));
@@ -187,6 +188,7 @@ async function acknowledge(...alarms) {
       if (!ok) wrong.push(`${alarm}: ${said(found.reason ?? found.error)}`);
       else {
         done += 1;
+        by = found.acknowledged?.by ?? operator(); // another operator may have been faster
         takeAll(all.map((one) => (one.alarm === alarm ? found : one)).filter((one) => one.state !== "normal"));
       }
     } catch {
@@ -194,7 +196,7 @@ async function acknowledge(...alarms) {
       break;
     }
   }
-  const first = done === 1 && alarms.length === 1 ? `${alarms[0].alarm}: ${t("acknowledged")}` : done ? several(done, "{n} alarm acknowledged", "{n} alarms acknowledged") : "";
+  const first = done === 1 && alarms.length === 1 ? `${alarms[0].alarm}: ${t("acknowledged")} ${t("by {name}", { name: by })}` : done ? several(done, "{n} alarm acknowledged", "{n} alarms acknowledged") : "";
   put("acknowledge-result", [first, ...wrong.slice(0, 5)].filter(Boolean).join(". "));
 }
 

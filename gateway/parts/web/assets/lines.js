@@ -2,13 +2,14 @@
 
 import { byId, clock, h, keyed, moment, put, span, style, svg } from "./dom.js";
 import { listed, said, several, t, whole } from "./language.js";
-import { gateway, now, on, post, signedIn } from "./stream.js";
+import { api, gateway, now, on, post, signedIn } from "./stream.js";
 import { wireOf } from "./wire.js";
 
 const KEPT = 360; // loads of a line: half an hour
 const SHORT = 4; // sentences of the overview before the rest is folded
 const LINES = 8; // of the overview
 const DAY = 86400e3; // ms
+const UNSEEN_EVERY = 10_000; // ms
 const SHOWN_STATES = 12;
 const SHOWN = 200; // devices or transfers
 const ORDER = { silent: 0, failing: 1, starting: 2, up: 3 };
@@ -68,8 +69,7 @@ function showWrong(state) {
   const count = state.faults.length;
   put("fault-count", String(count));
   byId("fault-count").hidden = !count;
-  const wanted = count + Number(byId("alarm-count").textContent || 0);
-  document.title = `${wanted ? `(${wanted}) ` : ""}${state.name}`;
+  entitle(count + Number(byId("alarm-count").textContent || 0));
   const listed = all ? sentences : sentences.slice(0, SHORT);
   const list = byId("wrong");
   keyed(list, listed, ([, text]) => text.replace(TIMES, ""), ([, text]) => {
@@ -96,6 +96,15 @@ function showWrong(state) {
     list.append(h("li", { className: "fold" }, h("button", { type: "button", className: "link", onclick: fold }, all ? t("Show less") : t("and {n} more", { n: sentences.length - SHORT }))));
   }
 }
+
+const entitle = (wanted) => (document.title = `${wanted ? `(${wanted}) ` : ""}${byId("name").textContent}`);
+
+// The title of a tab that is not seen, which has no stream.
+setInterval(async () => {
+  if (!document.hidden) return;
+  const { ok, found } = await api("status").catch(() => ({}));
+  if (document.hidden) entitle(ok ? found.faults.length + (found.alarms?.active ?? 0) + (found.alarms?.returned ?? 0) : "?");
+}, UNSEEN_EVERY);
 
 const TIMES = / \(for .*?\)|\d+% of the last \d+ requests/g; // what changes in a sentence
 

@@ -73,14 +73,15 @@ on("state", ({ you }) => {
   byId("account").hidden = !mayWrite;
   document.documentElement.classList.toggle("read-only", !mayWrite);
   put("account", name ? t("{name}: sign out", { name }) : t("Sign in"));
-  if (!asked || !sessionStorage.getItem("token")) return;
-  if (name) {
-    byId("token").value = "";
-    answered(true);
-  } else {
+  if (!sessionStorage.getItem("token")) return;
+  if (!name) { // wrong, or withdrawn: the next action asks for it
     sessionStorage.removeItem("token");
-    put("sign-in-why", t("The gateway does not know this token."));
+    if (asked) put("sign-in-why", t("The gateway does not know this token."));
+    return follow();
   }
+  if (!asked) return;
+  byId("token").value = "";
+  answered(true);
 });
 
 // -- requests --
@@ -130,6 +131,13 @@ setInterval(() => {
   for (const taker of takers.tick ?? []) taker();
 }, 500);
 
+// A browser has six connections to one gateway for all its tabs: one that is not seen has no stream.
+document.addEventListener("visibilitychange", () => {
+  awake = Date.now();
+  if (document.hidden) setLive(false, t("the page slept"));
+  run();
+});
+
 // -- the event stream --
 
 export function follow(change = {}) {
@@ -139,6 +147,8 @@ export function follow(change = {}) {
 
 async function run() {
   stream?.abort();
+  stream = null;
+  if (document.hidden) return;
   const mine = (stream = new AbortController());
   const query = new URLSearchParams();
   for (const [name, value] of Object.entries(choice)) if (value) query.set(name, value);

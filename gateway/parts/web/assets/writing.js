@@ -37,6 +37,7 @@ async function edit(key, button) {
   editor.addEventListener("submit", async (event) => {
     event.preventDefault();
     const text = input.value.trim();
+    if (!(await signedIn())) return;
     if (!gateway.live) return put(result, t("Not live: nothing was sent."));
     if (!editor.armed) {
       editor.armed = true;
