@@ -12,6 +12,7 @@ it, and what is true when the router is back. At the end one process of gateways
 import argparse
 import asyncio
 import json
+import logging
 import os
 import sys
 import tempfile
@@ -25,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import structlog
 import zenoh
 
 from gateway.cli.fleet.place import Place
@@ -160,6 +162,8 @@ class Gateway:
 
 async def serve(endpoints: list[str], folder: str, numbers: list[int]) -> None:
     """Is so many gateways, in this process, until its input ends."""
+    # A full pipe would block them all.
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     running = []
     for number in numbers:
         setup = zenoh.Config()

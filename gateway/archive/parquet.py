@@ -6,6 +6,7 @@ the number of rows that each of its parts had. After a crash the next page finds
 parts are cut to them first.
 """
 
+import fcntl
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -74,8 +75,8 @@ class ParquetStore:
         return found
 
     def add(self, rows: Sequence[Row], before: Cursor, after: Cursor) -> Cursor:
-        with _failures():
-            path = self._cursor_path(before.gateway)
+        path = self._cursor_path(before.gateway)
+        with _failures(), self._locked(path):
             with suppress(FileNotFoundError):
                 cursor, pending = self._read(path)
                 if cursor.after != before.after:
@@ -93,6 +94,23 @@ class ParquetStore:
 
     def close(self) -> None:
         pass
+
+    @contextmanager
+    def _locked(self, cursor: str) -> Iterator[None]:
+        """Keeps other archivers of the gateway away, also one that this one does not see. S3 and
+        some network file systems have no lock."""
+        if not self._is_local:
+            yield
+            return
+        Path(cursor).parent.mkdir(parents=True, exist_ok=True)
+        with Path(f"{cursor}.lock").open("wb") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise StoreDown("another archiver writes into this folder") from None
+            except OSError:
+                pass
+            yield
 
     # -- parts --
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Collection, Coroutine
 from contextlib import suppress
 from hashlib import sha256
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import zenoh
@@ -30,7 +31,9 @@ _SAID = {
 
 def group_of(store: str) -> str:
     """Returns the name of the group of all archivers of a store."""
-    parts = urlsplit(store)
+    if "://" not in store:
+        store = Path(store).resolve().as_uri()
+    parts = urlsplit(store.rstrip("/"))
     place = f"{parts.scheme}://{parts.hostname}:{parts.port}" if parts.hostname else parts.scheme
     return f"archive-{sha256(f'{place}{parts.path}?{parts.query}'.encode()).hexdigest()[:12]}"
 

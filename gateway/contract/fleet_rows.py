@@ -27,10 +27,11 @@ class State(IntEnum):
 @dataclass(frozen=True, slots=True)
 class Told:
     """The report of a gateway. `offset`: seconds that its clock is ahead of this computer's, beyond
-    the time of the query."""
+    the time of the query. `is_twin`: another gateway has the same name."""
 
     report: ReportDocument
     offset: float
+    is_twin: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +139,9 @@ def told_by(
             what = str(error).splitlines()
             mistakes.append(f"{gateway}: its report cannot be read: {' '.join(what[1:3]) or what}")
             continue
-        if gateway in found:
+        if is_twin := gateway in found:
             mistakes.append(f"two gateways are called {gateway}: give each its own `gateway.name`")
-        found[gateway] = Told(report, max(0.0, at - arrived) + min(0.0, at - asked))
+        found[gateway] = Told(report, max(0.0, at - arrived) + min(0.0, at - asked), is_twin)
     return found, mistakes
 
 

@@ -22,6 +22,7 @@ from gateway.archive.postgres import PostgresStore
 from gateway.archive.rows import Row, rfc3339, row_of
 from gateway.archive.store import Cursor, Gap, Overtaken, Store, StoreDown, cursor_of
 from gateway.archive.stores import store_at
+from gateway.archive.turn import group_of
 from gateway.bridges.documents import document_of
 from gateway.errors import ConfigError
 from tests.archive.servers import Postgres, postgres, s3
@@ -198,6 +199,25 @@ def test_a_crash_at_any_write_of_parquet_loses_and_doubles_nothing(
             done = int(cursor.after.rpartition("-")[2] or 0)
     assert crashes > 20
     assert sorted(stored(store)) == sorted(rows)
+
+
+def test_two_archivers_that_do_not_see_each_other_write_nothing_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other, begun = ParquetStore(str(tmp_path)), ParquetStore(f"{tmp_path}/"), Cursor(DEMO)
+    append = one._append
+
+    def beside(*arguments: Any) -> None:
+        with pytest.raises(StoreDown, match="another archiver"):
+            other.add(page(3), begun, after(begun, "3"))
+        append(*arguments)
+
+    monkeypatch.setattr(one, "_append", beside)
+    one.add(page(3), begun, after(begun, "3"))
+    with pytest.raises(Overtaken):
+        other.add(page(3), begun, after(begun, "3"))
+    assert len(stored(other)) == 3
+    assert group_of(str(tmp_path)) == group_of(f"{tmp_path}/") == group_of(tmp_path.as_uri())
 
 
 def test_parts_of_an_earlier_version_get_the_new_columns(tmp_path: Path) -> None:

@@ -348,6 +348,42 @@ def test_only_so_many_earlier_files_are_kept(run_virtual: Virtual, tmp_path: Pat
     run_virtual(whole())
 
 
+def test_a_clock_that_was_set_back_costs_no_way_back(run_virtual: Virtual, tmp_path: Path) -> None:
+    """The copies of the year before are not newer: the last one is the way back."""
+
+    async def whole() -> None:
+        gateway = Gateway(tmp_path)
+        part = await gateway.part()
+        for number in (1, 2):
+            found = await ask(part, "apply", file=file(f"D{number}"))
+            await ask(part, "confirm", digest=found["digest"])
+            await asyncio.sleep(1)
+        gateway.started += 1e6  # the clock
+        (tmp_path / "plant.yaml.kept" / "notes-of-ana.yaml").write_text("x")
+        await ask(part, "apply", file=file("D3"), confirm=60)
+        await beside(part, asyncio.sleep(61))
+        assert "D2" in gateway.path.read_text()
+        assert part.document()["state"] == "reverted"
+
+    run_virtual(whole())
+
+
+def test_a_file_that_a_person_has_replaced_is_not_confirmed(
+    run_virtual: Virtual, tmp_path: Path
+) -> None:
+    async def whole() -> None:
+        gateway = Gateway(tmp_path)
+        part = await gateway.part()
+        found = await ask(part, "apply", file=file("D1"))
+        gateway.path.write_text(file("D5"))
+        await gateway.reload()
+        with pytest.raises(BadValue, match="meanwhile a person had the gateway load"):
+            await ask(part, "confirm", digest=found["digest"])
+        assert part.document()["state"] == "waiting"
+
+    run_virtual(whole())
+
+
 def test_a_link_stays_a_link(run_virtual: Virtual, tmp_path: Path) -> None:
     async def whole() -> None:
         gateway = Gateway(tmp_path)

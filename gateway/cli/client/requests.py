@@ -21,6 +21,7 @@ from gateway.values import Value
 
 WRITER_VARIABLE = "PLC_GATEWAY_WRITER"
 OLD_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # of a version that sent its token
+LONGEST_ORDER = 250_000  # bytes: a gateway's link drops larger messages
 
 
 class Requests:
@@ -47,7 +48,11 @@ class Requests:
         """Returns the document of `alarms/<alarm>` or `doors/<door>` then, or `error ...`. `more`:
         seconds that the answer may take longer than others. Raises as `write`."""
         status = self._keys.status("status")
-        return self._request(self._keys.status(path), json.dumps(order).encode(), status, more)
+        data = json.dumps(order, ensure_ascii=False).encode()
+        if len(data) > LONGEST_ORDER:
+            size = f"{len(data) / 1000:.0f} kB, more than {LONGEST_ORDER / 1000:.0f}"
+            raise GatewayError(f"{path}: it has {size}: nothing was sent")
+        return self._request(self._keys.status(path), data, status, more)
 
     def write(self, tag: str, value: Value | dict[str, Value]) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.

@@ -61,7 +61,9 @@ def apply(
         raise ConfigError("\n".join([*mistakes, "nothing was sent"]))
     began = time.monotonic()
     with place.connected(connect, zenoh_file) as client:
-        told, _ = told_by(client.everywhere("report"), time.time())
+        told, unclear = told_by(client.everywhere("report"), time.time())
+        for mistake in unclear:
+            err.print(printable(mistake))
         steps, ended = _steps(wanted, told, _changes(client), do)
         for one in ended:
             _tell(one)
@@ -111,6 +113,8 @@ def _steps(
         want, one, change = wanted[gateway], told.get(gateway), changes.get(gateway)
         if one is None:
             ended.append(Ended(gateway, Result.UNREACHABLE, "no reply"))
+        elif one.is_twin:
+            ended.append(Ended(gateway, Result.REFUSED, "two gateways have this name: rename one"))
         elif change is None:
             ended.append(Ended(gateway, Result.REFUSED, "its file has no section `remote`"))
         elif change["state"] == "waiting" and do != "check":

@@ -52,10 +52,11 @@ class Folder:
             return ""
 
     def keep(self, digest: str, now: int) -> str:
-        """Copies the file to the earlier ones, and drops the oldest. Returns the name of the
-        copy."""
+        """Copies the file to the earlier ones, and drops the oldest. Returns the name of the copy,
+        which is the newest also after a clock was set back."""
         self._kept.mkdir(mode=0o700, exist_ok=True)
-        copy = self._kept / f"{now}-{digest}{self.path.suffix}"
+        newest = max((_at(one.file) for one in self.earlier()), default=0)
+        copy = self._kept / f"{max(now, newest + 1)}-{digest}{self.path.suffix}"
         files.put(copy, files.read(self.path), self.path.stat().st_mode)
         for old in [*self.earlier()][: -self._keep]:
             old.file.unlink(missing_ok=True)
@@ -63,7 +64,7 @@ class Folder:
 
     def earlier(self) -> Sequence[Kept]:
         """Returns the earlier files, the oldest first."""
-        named = sorted(self._kept.glob(f"*-*{self.path.suffix}")) if self._kept.is_dir() else []
+        named = sorted(self._kept.glob(f"*-*{self.path.suffix}"), key=_at)
         return [Kept(file, file.stem.partition("-")[2]) for file in named]
 
     def text(self, kept: Path) -> str:
@@ -81,3 +82,9 @@ class Folder:
     def put_back(self, copy: str) -> None:
         """Replaces the file by an earlier one. Raises `OSError`."""
         self.put(files.read(self._kept / copy))
+
+
+def _at(kept: Path) -> int:
+    """Returns the time in the name of an earlier file; 0 for the name of another program."""
+    text = kept.name.partition("-")[0]
+    return int(text) if text.isdecimal() and len(text) < 20 else 0

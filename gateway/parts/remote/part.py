@@ -127,6 +127,8 @@ class RemotePart:
                 await self._go_back(f"{by} took it back")
             case Do.CONFIRM if order.digest != self._change.digest:
                 raise BadValue(f"the file that waits is {self._change.digest}")
+            case Do.CONFIRM if order.digest != (running := self._file.current.digest):
+                raise BadValue(f"meanwhile a person had the gateway load {running}")
             case Do.CONFIRM:
                 await self._note(replace(self._change, state="confirmed", why=f"by {by}"))
 
