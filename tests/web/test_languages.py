@@ -157,6 +157,16 @@ async def test_a_choice_comes_before_the_file_and_the_file_before_the_browser() 
         assert await code(client) == "en"
 
 
+async def test_the_whole_page_is_small_over_the_wire() -> None:
+    files = {one.name for one in ASSETS["page"][0].iterdir()} - {"page.html"} | {"", "catalogue.js"}
+    async with serving() as client:
+        for language in LANGUAGES:
+            asked = {"Accept_Encoding": "gzip", "Accept_Language": language}
+            answers = [await client.ask(f"/{one}", **asked) for one in files]
+            assert {one.status for one in answers} == {200}
+            assert sum(len(one.body) for one in answers) < 120_000  # measured: 77,000
+
+
 def pseudo(language: languages.Language) -> Catalogue:
     """The catalogue of a language without Latin letters, also of its places."""
     found = catalogue(language)

@@ -108,11 +108,11 @@ setInterval(async () => {
 
 const TIMES = / \(for .*?\)|\d+% of the last \d+ requests/g; // what changes in a sentence
 
-const HEAD = new RegExp(`^(${t("line")} [^\\s：]+?(?:: |：)[^:：]*|[^:：]*)([:：] ?(.*))?$`, "s");
+const HEAD = new RegExp(`^((?:(?:${t("line")} )?[^\\s：]+?(?:: |：))?(?:(?!: |：).)*)(?:(?:: |：)(.*))?$`, "s");
 
-// A sentence in two: what is wrong, and its cause.
+// A sentence in two: what is wrong, with the name of the line or device, and its cause.
 function parted(text) {
-  const [, head, , rest = ""] = said(text).match(HEAD) ?? [null, said(text)];
+  const [, head, rest = ""] = said(text).match(HEAD) ?? [null, said(text)];
   return { head, rest };
 }
 
