@@ -163,10 +163,15 @@ async def test_an_alarm_is_acknowledged_and_a_value_written_after_one_sign_in(
         client.north.orders = client.plant.parts.alarms.order
         client.north.endings[b"90"] = WriteResult(90, 0, 0.03, verified=True)
         await opened(tab, client, "alarms")
-        await tab.click('#alarms-list button[aria-label="acknowledge oven/temperature"]')
+        button = '#alarms-list button[aria-label="acknowledge oven/temperature"]'
+        await tab.until(f"!!document.querySelector('{button}')")
+        await tab.value(f"document.querySelector('{button}').focus()")
+        await tab.press("Enter")
         await sign_in(tab)
         await tab.until(f"{text('#alarms-list')}.includes('acknowledged by Ana')")
         assert client.north.written[0][2] == "web alice"
+        focused = "document.activeElement.getAttribute('aria-label')"
+        assert await tab.value(focused) == "shelve oven/temperature"  # for the keyboard
         await tab.click('#alarms-list button[aria-label="shelve oven/temperature"]')
         await tab.until("document.activeElement.id === 'shelve-reason'")
         await tab.type("sensor broken")
@@ -334,10 +339,12 @@ async def test_fifty_thousand_tags_scroll_in_a_few_rows(tab: Tab) -> None:
         await tab.until(f"{text('#tags-title')} === '50,000 tags'")
         names = texts("#space .name")
         await tab.until(f"{names}[0] === 'd0/t0'")
+        await tab.value("document.querySelector('#space .row a').focus()")
         for place, name in (("1e9", "d99/t499"), ("0", "d0/t0"), ("25000 * 60", "d5")):
             await tab.value(f'document.getElementById("window").scrollTop = {place}')
             await tab.until(f"{names}.some((one) => one.startsWith('{name}'))")
             assert await tab.value('document.querySelectorAll("#space .row").length') < 60
+            assert await tab.value('!!document.activeElement.closest("#window")')
         await tab.value('document.getElementById("find").focus()')
         await tab.type("d42/t4")
         await tab.until(f"{text('#tags-title')}.startsWith('111 tags')")

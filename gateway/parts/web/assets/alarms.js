@@ -118,10 +118,12 @@ function showRow(row, one) {
   row.parts.hidden = !parts.length;
   put(row.count, several(parts.length, "{n} device", "{n} devices"));
   put(row.names, parts.join(", "));
+  const focused = document.activeElement === row.button;
   row.button.hidden = done || !gateway.you[1];
   row.button.setAttribute("aria-label", t("acknowledge {alarm}", one));
   row.shelve.hidden = !gateway.you[1];
   row.shelve.setAttribute("aria-label", t("shelve {alarm}", one));
+  if (focused && row.button.hidden) row.shelve.focus(); // the keyboard stays at this alarm
   style(row, `alarm ${state}`);
 }
 

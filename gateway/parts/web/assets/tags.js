@@ -115,10 +115,12 @@ function draw() {
   const [first, end] = inSight();
   const places = Array.from({ length: Math.max(0, end - first) }, (_, number) => first + number);
   byId("list").setAttribute("aria-rowcount", total + 1);
+  const focused = space.contains(document.activeElement);
   keyed(space, places, (number) => `${number} ${keys[number] ?? ""}`, makeRow, (row, number) => {
     row.style.transform = `translateY(${number * height}px)`;
     showRow(row);
   });
+  if (focused && !space.contains(document.activeElement)) view.focus({ preventScroll: true }); // its row scrolled away
 }
 
 function makeRow(number) {
