@@ -10,7 +10,6 @@ A gateway process serves a history file to clients in processes of their own. Me
 
 import argparse
 import asyncio
-import os
 import subprocess
 import sys
 import tempfile
@@ -23,9 +22,9 @@ import zenoh
 
 from benchmarks.history import tags
 from benchmarks.northbound import Device, Plant
-from gateway.config import ZenohConfig, ZenohMode
+from benchmarks.northbound_clients import session_with
+from gateway.config import ZenohConfig
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session.session_settings import configure
 from gateway.parts.history.answers.recent import MOST_RUNS
 from gateway.parts.history.historian import Historian
 from gateway.service.service import THREAD_SWITCH
@@ -84,35 +83,12 @@ async def serve(endpoint: str, path: Path, count: int) -> None:
         await asyncio.Event().wait()
 
 
-def read(endpoint: str) -> None:
-    """Reads the whole history again and again; prints the number of samples so far."""
-    os.nice(19)  # a client has a processor of its own, but not here
-    count = 0
-    with _session(endpoint) as session:
-        while True:
-            for _ in session.get("plant/**?_time=[..]", timeout=600.0):
-                count += 1
-                if count % 1000 == 0:
-                    print(count, flush=True)
-
-
 # -- the measurements --------------------------------------------------------------------------
 
 
-def _session(endpoint: str) -> zenoh.Session:
-    """Opens a session that knows the gateway."""
-    config = configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))
-    config.insert_json5("connect/timeout_ms", "60000")
-    session = zenoh.open(config)
-    with session.declare_querier("plant/**") as querier:
-        while not querier.matching_status.matching:  # type: ignore[attr-defined]
-            time.sleep(0.001)
-    return session
-
-
 @contextmanager
-def other(*arguments: object) -> Iterator["subprocess.Popen[str]"]:
-    command = [sys.executable, "-m", "benchmarks.history_queries", *map(str, arguments)]
+def other(program: str, *arguments: object) -> Iterator["subprocess.Popen[str]"]:
+    command = [sys.executable, "-m", f"benchmarks.{program}", *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             assert process.stdout is not None
@@ -126,12 +102,12 @@ def beside(folder: Path, samples: int, rounds: int, queries: int) -> None:
     path, endpoint = folder / "beside.db", free_endpoint()
     write(path, tags(1000), samples)
     alone, crowded = list[float](), list[float]()
-    with other("serve", endpoint, path, 1000), _session(endpoint) as session:
+    with other("history_queries", "serve", endpoint, path, 1000), session_with(endpoint) as session:
         for _ in range(rounds):
             alone += _asked(session, queries)
             with ExitStack() as stack:
                 for _ in range(3):
-                    stack.enter_context(other("read", endpoint))
+                    stack.enter_context(other("northbound_clients", "read", endpoint))
                 crowded += _asked(session, queries)
     for what, took in (("alone", sorted(alone)), ("beside three readers", sorted(crowded))):
         p50, p99 = took[len(took) // 2], took[int(len(took) * 0.99)]
@@ -153,7 +129,7 @@ def catch_up(folder: Path, count: int, samples: int) -> None:
     path, endpoint = folder / "catch-up.db", free_endpoint()
     write(path, tags(count), samples)
     example = [sys.executable, "examples/catch_up.py", "--connect", endpoint]
-    with other("serve", endpoint, path, count):
+    with other("history_queries", "serve", endpoint, path, count):
         begun = time.perf_counter()
         with subprocess.Popen(
             [*example, "--since", "2000-01-01T00:00:00Z"], stdout=subprocess.PIPE, cwd=ROOT
@@ -176,10 +152,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--queries", type=int, default=100)
     parser.add_argument("--missed", type=int, default=2_400_000)
+    parser.add_argument("--tags", type=int, default=40_000)
     parser.add_argument("--folder", type=Path, help="a folder on the disk to be measured")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as name:
-        catch_up(Path(name), 40_000, given.missed)
+        catch_up(Path(name), given.tags, given.missed)
         beside(Path(name), given.samples, given.rounds, given.queries)
 
 
@@ -187,7 +164,5 @@ if __name__ == "__main__":
     match sys.argv[1:]:
         case ["serve", where, path, count]:
             asyncio.run(serve(where, Path(path), int(count)))
-        case ["read", where]:
-            read(where)
         case _:
             main()

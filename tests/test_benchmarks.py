@@ -62,7 +62,7 @@ TINY = [
     ),
     (
         "history_queries",
-        "--samples 2000 --rounds 1 --queries 2 --missed 200",
+        "--samples 2000 --rounds 1 --queries 2 --missed 200 --tags 400",
         [r"^catch_up of 200 samples", r"^get plant/\*\* beside three readers: p50 [\d.]+ ms"],
     ),
     ("idle_remote", "--seconds 0.5 --pairs 1", [r"^ratio: [\d.]+ \("]),
@@ -151,6 +151,7 @@ PARTS_OF_OTHERS = {
     "__init__",
     "checkouts",
     "drawing",
+    "northbound_clients",
     "paced_wire",
     "plant_consumer",
     "scenario_clients",

@@ -51,16 +51,22 @@ class DeviceServer(Bench):
 
     def received(self, data: bytes) -> None:
         if self.ear is not None:
-            asyncio.get_running_loop().call_later(self.latency, self.ear.received, data)
+            loop, receive = asyncio.get_running_loop(), self.ear.received
+            if self.latency:
+                loop.call_later(self.latency, receive, data)
+            else:
+                loop.call_soon(receive, data)
 
     async def _serve(self) -> None:
         while True:
             request = await self._queue.get()
             await self.flows.wait()
-            await asyncio.sleep(len(request) * WIRE.character)
+            arrives = len(request) * WIRE.character
             if self.echo:
+                await asyncio.sleep(arrives)
                 self.received(request)
-            await asyncio.sleep(0.005)
+                arrives = 0.0
+            await asyncio.sleep(arrives + 0.005)
             answers = [] if self.deaf_to(request) else self._station.hear(request, now())
             for answer in answers:
                 await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))

@@ -13,7 +13,8 @@ from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 
-from benchmarks.northbound import Lag, memory
+from benchmarks.northbound import memory
+from benchmarks.northbound_clients import Lag
 from gateway.config import ZenohConfig
 from tests.e2e.processes import slowed
 from tests.northbound.plant import PlainDevice, PlainPlant, serving, tag
@@ -32,7 +33,7 @@ def plant() -> PlainPlant:
 
 
 def other(*arguments: str) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "benchmarks.northbound", *arguments, SECONDS]
+    command = [sys.executable, "-m", "benchmarks.northbound_clients", *arguments, SECONDS]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
 
 
