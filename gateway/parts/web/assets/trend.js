@@ -277,7 +277,7 @@ function draw(uPlot) {
     cursor: { drag: { x: true, y: false, setScale: false }, points: { size: 8 }, bind: { dblclick: () => () => choose({ from: "", to: "" }) } },
     scales: { x: { time: true }, ...Object.fromEntries(scales.map((name) => [name, name === "bit" ? { range: [-0.1, 1.1] } : {}])) },
     axes: [
-      { ...line, space: narrow ? 58 : 80, values: (_, splits, axis, space, step) => times(splits, step) },
+      { ...line, space: narrow ? 44 : 80, values: (_, splits, axis, space, step) => times(splits, step) },
       ...scales.map((name, at) => ({
         ...line, scale: name, side: at ? 1 : 3, show: at < AXES, grid: { ...line.grid, show: at === 0 },
         size: narrow ? 46 : 64, ...(!narrow && name !== "bit" && { label: name.slice(2), labelSize: 22, labelFont: line.font }),

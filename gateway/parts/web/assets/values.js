@@ -67,7 +67,7 @@ export function shown(tag) {
 }
 
 // The code of the reason and its sentence, or where the value is from.
-export const reasons = (why) => why.replace(/^(\S+) ?(.*)$/s, (_, code, rest) => `${said(code)} ${said(rest)}`).trim();
+export const reasons = (why) => why.replace(/^(\S+) ?(.*?)( simulated| replayed| computed)?$/s, (_, code, rest, origin = "") => `${said(code)} ${said(rest)} ${said(origin.trim())}`).trim();
 
 // `short`: without the sentence after the code.
 const quality = ({ last }, short) => (!last ? "" : last.good ? reasons(last.why) || t("good") : `${said(last.quality)}: ${reasons(short ? last.why.split(" ")[0] : last.why).split(/: |：/)[0]}`);
