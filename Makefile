@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator upgrade bench scenarios peers plant reloads pictures pins crowd bridges archive parsers contract docs clean sbom release bundle
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults histories operator upgrade bench scenarios peers plant reloads pictures pins crowd bridges archive fleet parsers contract docs clean sbom release bundle
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -177,6 +177,10 @@ bridges: .venv/ready
 # Archivers, databases and gateways killed at random; what the archive has then (docs/archive.md).
 archive: .venv/ready
 	$(BIN)/python -m tests.archive.campaign --kills $(KILLS) --seed $(SEED)
+
+# 1,000 gateways behind three routers: seen, changed, parted and killed (docs/fleet.md).
+fleet: .venv/ready
+	$(BIN)/python -m benchmarks.fleet
 
 # Ten gateways in network namespaces get a new version, one after the other; one has a bug
 # (docs/upgrade-fleet.md).

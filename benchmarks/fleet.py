@@ -6,7 +6,8 @@ Each gateway here is a Zenoh session of its own with a configuration file, a rep
 the file gives it station 31. The program prints how long `fleet` takes, and whether it names
 exactly the files that differ; how long `fleet apply` takes for all; whether a file that is never
 confirmed goes back in its time everywhere; what a rollout says when a router fails in the middle of
-it, and what is true when the router is back. At the end one process of gateways is killed.
+it, and what is true when the router is back. At the end one process of gateways is killed. The exit
+code is 1 if a gateway was left out, a name was wrong or a file stayed: not for the times.
 """
 
 import argparse
@@ -185,11 +186,16 @@ async def serve(endpoints: list[str], folder: str, numbers: list[int]) -> None:
 
 
 class Bench:
-    """The commands, as a person runs them."""
+    """The commands, as a person runs them. `wrong`: what is not as it must be."""
 
     def __init__(self, endpoint: str, folder: Path, count: int, parallel: int) -> None:
         self.endpoint, self.folder, self.count = endpoint, folder, count
         self.parallel = parallel
+        self.wrong: list[str] = []
+
+    def judge(self, what: str, found: object, right: object) -> None:
+        if found != right:
+            self.wrong.append(f"{what}: {found}, and not {right}")
 
     def files(self, name: str, level: int) -> Path:
         folder = self.folder / name
@@ -255,6 +261,8 @@ async def seen(bench: Bench, folder: Path) -> None:
     others = range(0, bench.count, EVERY_OTHER)
     wanted = {f"{PREFIX}/hall-{number % 20}/g{number}" for number in others}
     told = sum(row["state"] != "missing" for row in rows)
+    bench.judge("gateways that replied", told, bench.count)
+    bench.judge("files that differ", drift, wanted)
     print(f"{told} of {bench.count} gateways in {quick:.1f} s, with their files in {whole:.1f} s")
     print(f"files that differ: {len(drift)} named, {len(drift ^ wanted)} of them wrong", flush=True)
 
@@ -262,10 +270,13 @@ async def seen(bench: Bench, folder: Path) -> None:
 async def changed(bench: Bench) -> None:
     folder = bench.files("second", 9002)
     checked, counts = await bench.apply(folder, "--check")
+    bench.judge("checked", counts["good"], bench.count)
     print(f"checked: {counts['good']} good, in {checked:.1f} s", flush=True)
     took, counts = await bench.apply(folder)
+    bench.judge("a change on all", counts["confirmed"], bench.count)
     print(f"a change on all: {counts['confirmed']} confirmed, in {took:.1f} s", flush=True)
     took, counts = await bench.apply(folder)
+    bench.judge("the same again", counts["same"], bench.count)
     print(f"the same again: {counts['same']} the same, in {took:.1f} s", flush=True)
 
 
@@ -302,8 +313,10 @@ async def parted(bench: Bench, router: ZenohPeer, again: Any) -> None:
     while len(after := await bench.digests()) < bench.count:
         pass
     new = sum(after[name][0] != before[name][0] for name in after)
+    bench.judge("new files after a partition", new, counts["confirmed"])
     print(f"the router is back: {new} run the new file, {counts['confirmed']} were said to")
     took, counts = await bench.apply(folder)
+    bench.judge("the next run", counts["same"] + counts["confirmed"], bench.count)
     print(f"the next run: {counts['same']} the same, {counts['confirmed']} confirmed", flush=True)
 
 
@@ -353,10 +366,13 @@ async def main() -> None:
         gone = len(range(0, count, processes))
         quick, rows, _ = await bench.fleet("--folder", first)
         missing = sum(row["state"] == "missing" for row in rows)
+        bench.judge("killed", missing, gone)
         print(f"{gone} gateways killed: {missing} missing, in {quick:.1f} s")
         for process in running[1:]:
             process.kill()
             await process.wait()
+    if bench.wrong:
+        sys.exit("\n".join(bench.wrong))
 
 
 if __name__ == "__main__":

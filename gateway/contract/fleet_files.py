@@ -96,7 +96,9 @@ def _is_of_another_program(file: Path) -> bool:
 
 def main() -> None:
     os.nice(_LESS_IMPORTANT)
-    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    most = _MOST_MEMORY if hard == resource.RLIM_INFINITY else min(hard, _MOST_MEMORY)
+    resource.setrlimit(resource.RLIMIT_AS, (most, hard))
     wanted, mistakes = wanted_in(Path(sys.argv[1]))
     found = {gateway: (str(one.file), one.digest) for gateway, one in wanted.items()}
     print(json.dumps([found, mistakes]))

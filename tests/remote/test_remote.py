@@ -384,6 +384,25 @@ def test_a_file_that_a_person_has_replaced_is_not_confirmed(
     run_virtual(whole())
 
 
+def test_a_disk_that_does_not_read_forgets_no_change(run_virtual: Virtual, tmp_path: Path) -> None:
+    async def whole() -> None:
+        gateway = Gateway(tmp_path)
+        part = await gateway.part()
+        await ask(part, "apply", file=file("D1"), confirm=60)
+        state = tmp_path / "remote.json"
+        kept = state.read_bytes()
+        state.unlink()
+        state.mkdir()  # as if the disk refused it
+        with pytest.raises(GatewayError, match=r"remote\.json cannot be read"):
+            await gateway.part()
+        state.rmdir()
+        state.write_bytes(kept)
+        await beside(await gateway.part(), asyncio.sleep(61))
+        assert "D0" in gateway.path.read_text()
+
+    run_virtual(whole())
+
+
 def test_a_link_stays_a_link(run_virtual: Virtual, tmp_path: Path) -> None:
     async def whole() -> None:
         gateway = Gateway(tmp_path)

@@ -68,12 +68,20 @@ class RemotePart:
     # -- its life --
 
     async def restore(self) -> None:
-        change = await off_loop(self._saved.load, _parsed, within=DISK_WITHIN)
+        change = await off_loop(self._last_change, within=DISK_WITHIN)
         self._earlier = await off_loop(self._names, within=DISK_WITHIN)
         if change is not None:
             self._change = change
         if self._change.state == "waiting":
             self._wait()
+
+    def _last_change(self) -> Change | None:
+        """Raises `GatewayError` for a file that cannot be read now: a change in it may wait. Then
+        this part fails, which is a fault, and is made again."""
+        change = self._saved.load(_parsed)
+        if change is None and self._settings.path.exists():
+            raise GatewayError(f"{self._settings.path} cannot be read: a file in it may wait")
+        return change
 
     def activate(self) -> None:
         self._active = True

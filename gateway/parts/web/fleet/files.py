@@ -59,7 +59,8 @@ class FleetFiles:
 
     def _read(self) -> Found:
         """Raises `GatewayError`. Blocks."""
-        command = [sys.executable, "-m", "gateway.contract.fleet_files", str(self._folder)]
+        # `-P`: modules of this program only, not those of the working directory.
+        command = [sys.executable, "-P", "-m", "gateway.contract.fleet_files", str(self._folder)]
         try:
             done = subprocess.run(  # noqa: S603  (this program, with the folder of the file)
                 command, capture_output=True, timeout=READ_WITHIN, check=True
