@@ -30,7 +30,7 @@ def on_the_wire(
     return replies
 
 
-@pytest.mark.parametrize("delay", [0.002, 0.06, 0.3, 0.9])
+@pytest.mark.parametrize("delay", [0.002, 0.06, 0.3, 0.9, 1.5, 4.0])
 def test_a_late_echo_is_never_answered_as_a_request(delay: float) -> None:
     """Only the first one is doubtful: "busy" shows that the adapter echoes, and writes nothing."""
     made = bench()
@@ -87,3 +87,32 @@ def test_with_echo_in_the_file_nothing_is_learned() -> None:
     assert [told.ask(WRITE, after=0.5) for _ in range(4)] == [WRITE, b"", WRITE, b""]
     never = bench(echo=False)
     assert [never.ask(WRITE, after=0.01) for _ in range(4)] == [WRITE] * 4
+
+
+@pytest.mark.parametrize("delay", [0.06, 1.5, 8.0, 30.0])
+def test_a_refusal_that_returns_is_no_request(delay: float) -> None:
+    """Its function is that of no master: an answer would return, and so on for ever."""
+    refused = rtu("01 03 0999 0001")
+    assert [reply for _, reply in on_the_wire(bench(), [(1.0, refused)], delay)] == [
+        rtu("01 83 02")
+    ]
+
+
+def test_a_late_echo_that_ends_is_forgotten() -> None:
+    made = bench()
+    assert len(on_the_wire(made, [(5.0, WRITE)], 1.5)) == 2
+    assert made.ask(WRITE, after=10) == WRITE
+    assert made.ask(WRITE, after=1.5) == b""
+    for _ in range(6):
+        assert made.ask(READ, after=5) == VALUE
+    assert [made.ask(WRITE, after=1.5) for _ in range(4)] == [WRITE] * 4
+
+
+@pytest.mark.parametrize("request_", [WRITE, rtu("01 03 0999 0001")])
+def test_two_gateways_with_one_number_do_not_answer_each_other_for_ever(request_: bytes) -> None:
+    twins, passed = (bench(), bench()), 0
+    said = twins[0].ask(request_)
+    while said and passed < 100:
+        passed += 1
+        said = twins[passed % 2].ask(said, after=0.02)
+    assert passed < 5

@@ -6,10 +6,12 @@ is none when they do not. Where only equal frames are known, the station replies
 master repeats its request, and an echo returns the "busy".
 """
 
+from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 
-_LATEST = 1.0  # seconds after its reply within which an echo arrives
+_LATEST = 1.0  # seconds after its reply within which an echo arrives, as long as none came later
+_OLDEST, _MOST_OLD = 10.0, 16  # seconds and replies for which a later echo is recognised
 _EARLY = 0.5  # times the shortest known delay: a frame before that is no echo
 _MISSES = 3  # replies without an echo, in a row, until the adapter does not echo any more
 _AGAIN, _MORE = 8, 8  # equal frames in a row until the station asks again; then so many times more
@@ -39,7 +41,9 @@ class Echo:
     told: bool | None = None
     _known: bool | None = None
     _delay: float = 0.0  # the shortest one
+    _latest: float = _LATEST
     _replies: list[_Reply] = field(default_factory=list)
+    _old: deque[_Reply] = field(default_factory=lambda: deque(maxlen=_MOST_OLD))  # without an echo
     _misses: int = 0
     _equal: int = 0  # frames in a row that were equal to the reply before
     _limit: int = _AGAIN
@@ -47,7 +51,7 @@ class Echo:
     def pending(self, now: float) -> list[bytes]:
         """Returns the echoes that may arrive next."""
         self._forget(now)
-        return [reply.frame for reply in self._replies]
+        return [reply.frame for reply in (*self._old, *self._replies)]
 
     def sent(self, reply: bytes, now: float, *, proves: bool) -> None:
         """Notes a reply. `proves`: its form is that of no request."""
@@ -58,6 +62,8 @@ class Echo:
         """Returns the origin of a frame."""
         self._forget(now)
         place = next((i for i, one in enumerate(self._replies) if one.frame == frame), None)
+        if place is None and self.told is None:
+            return self._late(frame, now)
         if place is None or self.told is False:
             self._equal = 0
             return Sort.REQUEST
@@ -70,6 +76,20 @@ class Echo:
             return Sort.REQUEST
         self._misses = self._equal = 0
         del self._replies[: place + 1]
+        return Sort.ECHO
+
+    def _late(self, frame: bytes, now: float) -> Sort:
+        """Judges a frame that is equal to no reply of the last time: an echo may be slower."""
+        old = next((one for one in self._old if one.frame == frame), None)
+        if old is None:
+            self._equal = 0
+            return Sort.REQUEST
+        if not old.proves:
+            return self._doubt(0)
+        self._known, self._delay, self._misses = True, now - old.at, 0
+        self._latest = min(2 * self._delay, _OLDEST)
+        self._replies[:0] = [one for one in self._old if one.at > old.at]  # these may still return
+        self._old.clear()
         return Sort.ECHO
 
     def _doubt(self, place: int) -> Sort:
@@ -85,14 +105,21 @@ class Echo:
         elif place:
             return Sort.REQUEST
         self._replies.clear()
+        self._old.clear()
         return Sort.DOUBTFUL
 
     def _forget(self, now: float) -> None:
         """Drops the replies whose echo did not arrive."""
-        while self._replies and now - self._replies[0].at > _LATEST:
+        while self._old and now - self._old[0].at > _OLDEST:
+            self._old.popleft()
+        while self._replies and now - self._replies[0].at > self._latest:
             one = self._replies.pop(0)
+            if self.told is None:
+                self._old.append(one)
             self._misses += 1
-            if self._known:
-                self._known = None if self._misses >= _MISSES else True
+            if self._known and self._misses >= _MISSES:
+                self._known, self._latest = None, _LATEST
+            elif self._known:
+                continue
             elif one.proves:
                 self._known = False

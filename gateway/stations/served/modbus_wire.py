@@ -98,7 +98,8 @@ class _Serial:
         if not ours:
             return SILENCE
         request = frames[-1]
-        if request is not ours[-1] or reader.following > NOISE:
+        # An exception is the reply of a twin, or our own: an answer to it would return.
+        if request is not ours[-1] or reader.following > NOISE or request.pdu[0] & EXCEPTION:
             return Heard(stale=len(ours))
         stale = len(ours) - 1
         if request.station == 0:
