@@ -21,6 +21,11 @@ TINY = [
         [r"^20 tags: known after [\d.]+ s, all watched", r"^[\d,]+ changes/s offered: .* 0 lost"],
     ),
     (
+        "adapters",
+        "--count 2 --seconds 0.5",
+        [r"^2 adapters, timer 16 ms: [\d.]+ of a core, \d+ MB, [\d.]+ polls/s, \d+ ms each"],
+    ),
+    (
         "archive",
         "--samples 2000 --gateways 8 --history 2000 --seconds 1 --store parquet",
         [
