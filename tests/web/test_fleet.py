@@ -81,13 +81,14 @@ async def test_damaged_reports_are_mistakes_and_hide_no_other() -> None:
 
 
 async def test_the_files_of_a_folder_are_compared_and_read_again_after_a_change(
-    tmp_path: Path,
+    tab: Tab, tmp_path: Path
 ) -> None:
-    file = tmp_path / "good.yaml"
+    (folder := tmp_path / "files").mkdir()
+    file = folder / "good.yaml"
     north = FILE | {"zenoh": {"prefix": "works/north"}}
     file.write_text(dumped(north | {"gateway": {"name": "good"}}))
-    (tmp_path / "gone.yaml").write_text(dumped(FILE | {"gateway": {"name": "gone"}}))
-    (tmp_path / "other.yaml").write_text(dumped(FILE | {"zenoh": {"prefix": "elsewhere"}}))
+    (folder / "gone.yaml").write_text(dumped(FILE | {"gateway": {"name": "gone"}}))
+    (folder / "other.yaml").write_text(dumped(FILE | {"zenoh": {"prefix": "elsewhere"}}))
 
     async def compared(client: Client) -> dict[str, str]:
         found = (await client.ask("/api/fleet")).json
@@ -96,7 +97,7 @@ async def test_the_files_of_a_folder_are_compared_and_read_again_after_a_change(
             found = (await client.ask("/api/fleet")).json
         return {one["gateway"]: one["says"] for one in found["gateways"]}
 
-    async with serving(fleet=tmp_path) as client:
+    async with serving(fleet=folder) as client:
         sick = {**FAULT, "digest": "other"}
         client.north.fleet = partial(reports, good={"digest": load(file).digest}, sick=sick)
         assert await compared(client) == {
@@ -106,6 +107,9 @@ async def test_the_files_of_a_folder_are_compared_and_read_again_after_a_change(
         }
         file.write_text(file.read_text().replace("D0", "D1"))
         assert (await compared(client))["works/north/good"] == "its file differs from good.yaml"
+        await tab.open(f"http://127.0.0.1:{client.port}/#fleet")
+        await tab.until(f"{text('#fleet-drift')} === 'Files: no file 1 · differs 1'")
+        assert "its file differs from good.yaml" in await tab.value(text("#fleet-list"))
 
 
 async def test_a_folder_that_cannot_be_read_hides_no_gateway(tmp_path: Path) -> None:
