@@ -1,6 +1,7 @@
 """Programs that have a wire alone, with pyserial's client and server, on ptys and sockets."""
 
 import asyncio
+import sys
 import termios
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -127,6 +128,41 @@ async def test_speed_and_format_of_a_tool_reach_the_port_and_are_put_back() -> N
         flags, speed = master.format()
         assert (speed, flags & termios.CSTOPB) == (termios.B9600, 0)
         assert f"it had the wire, and sent {len(EVERY_BYTE) + 1} bytes" in found.told[0]
+    master.unplug()
+
+
+KILLED = """
+import sys, time
+from serial.rfc2217 import Serial
+url = f"rfc2217://127.0.0.1:{sys.argv[1]}?timeout=60"
+port = Serial(url, baudrate=4800, stopbits=2, timeout=60)
+port.write(b"!")
+print("ready", flush=True)
+time.sleep(600)
+"""
+
+
+async def test_settings_are_put_back_after_a_tool_was_killed() -> None:
+    master, port = PtyMaster(), free_port()
+    async with hall(master.path, listen=f"127.0.0.1:{port}") as found:
+        (await tool(port)).close()  # the door is open
+        await found.until(lambda: found.told and found.open)
+        killed = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-W", "ignore", "-c", KILLED, str(port)),
+            stdout=asyncio.subprocess.PIPE,
+        )
+        assert killed.stdout is not None
+        try:
+            async with asyncio.timeout(PATIENCE):
+                assert await killed.stdout.readline() == b"ready\n"
+            assert master.format()[1] == termios.B4800
+            assert not found.open
+        finally:
+            killed.kill()
+            await killed.wait()
+        await found.until(lambda: found.open)
+        flags, speed = master.format()
+        assert (speed, flags & termios.CSTOPB) == (termios.B9600, 0)
     master.unplug()
 
 
