@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
@@ -29,6 +30,7 @@ from gateway.errors import ConfigError
 _ORDER = ("active", "returned", "acknowledged", "normal")
 _URGENT = {"critical": -1, "high": 0, "low": 2}  # of others 1
 _STYLES = {"active": "red", "returned": "yellow", "acknowledged": "yellow"}
+_AT_ONCE = 32  # acknowledgements
 _MISTAKES = ("bad-value", "unknown-tag")
 
 
@@ -138,8 +140,18 @@ def _acknowledge_all(
     """Acknowledges each alarm as it is now: one that is raised again meanwhile stays active."""
     open_ones = [one for one in client.alarms() if one["state"] in ("active", "returned")]
     found = [one for one in open_ones if fnmatchcase(one["alarm"], pattern)]
-    orders = ((one["alarm"], fields | {"raised": one["raised"]}) for one in found)
-    failed = [alarm for alarm, order in orders if _order(client, alarm, order, as_json=as_json)]
+
+    def send(one: dict[str, Any]) -> dict[str, object]:
+        return client.requests.order(f"alarms/{one['alarm']}", fields | {"raised": one["raised"]})
+
+    # The gateway writes its file once for all that arrive together.
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
+        answers = zip(found, threads.map(send, found), strict=True)
+        failed = [
+            one["alarm"]
+            for one, answer in answers
+            if _said(one["alarm"], fields, answer, as_json=as_json)
+        ]
     if not as_json:
         done = f"{len(found) - len(failed)} of {len(found)} alarms acknowledged"
         print(done if found else f"no alarm of '{pattern}' waits for acknowledgement")
@@ -150,6 +162,13 @@ def _acknowledge_all(
 def _order(client: Client, alarm: str, fields: dict[str, object], *, as_json: bool) -> str:
     """Sends an order, and prints its answer. Returns the error word; empty: it is done."""
     answer = client.requests.order(f"alarms/{alarm}", fields)
+    return _said(alarm, fields, answer, as_json=as_json)
+
+
+def _said(
+    alarm: str, fields: dict[str, object], answer: dict[str, object], *, as_json: bool
+) -> str:
+    """Prints the answer to an order. Returns the error word; empty: it is done."""
     if as_json:
         print(json.dumps(answer))
     if "error" in answer:
@@ -215,7 +234,7 @@ def past_view(found: Sequence[dict[str, Any]]) -> RenderableType:
             Text(one.get("priority", "")),
             Text(f"{what} {one['level']}" if what in ("raised", "eased") else what),
             Text(one["state"], style=_STYLES.get(one["state"], "")),
-            Text(printable(f"{one['value_at_change']} {one['unit']}".strip())),
+            Text(printable(_shown(one["value_at_change"], one["unit"]))),
             Text(printable(by.get("by") or "")),
             Text(printable(reason)),
         )
@@ -237,6 +256,10 @@ def _value(one: dict[str, Any]) -> str:
         return f"bad {one.get('reason') or ''}".strip()
     if "time" not in one:  # of a line or a device
         return "-"
-    if isinstance(one["value"], bool):
-        return "on" if one["value"] else "off"
-    return f"{one['value']} {one['unit']}".strip()
+    return _shown(one["value"], one["unit"])
+
+
+def _shown(value: object, unit: str) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return f"{value} {unit}".strip()

@@ -1,5 +1,7 @@
 """The `control` command: sends a command like `run` or `stop` to a PLC."""
 
+import json
+import sys
 from typing import Annotated
 
 import typer
@@ -7,9 +9,10 @@ import typer
 from gateway.cli import completion
 from gateway.cli.client import connected
 from gateway.cli.progress import loaded
-from gateway.cli.terminal import ConfigPath, Direct, end, err, printable
+from gateway.cli.terminal import AsJson, ConfigPath, Direct, end, err, printable
 from gateway.cli.write import error_code, outcome
 from gateway.config.commands import check_command, line_of
+from gateway.contract import payload
 
 
 def control(
@@ -18,6 +21,7 @@ def control(
     command: Annotated[str, typer.Argument(metavar="COMMAND", help="run, stop, model ...")],
     argument: Annotated[str, typer.Argument(metavar="[ARGUMENT]", help="text; on, off")] = "",
     without_gateway: Direct = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run or stop a PLC, and other commands that the file allows by `control: true`."""
     plant = loaded(config)
@@ -26,10 +30,16 @@ def control(
         from gateway.cli.line import direct
 
         direct.alone(plant)
-        print(direct.run(direct.control(plant, device, command, argument)).answer)
+        done = direct.run(direct.control(plant, device, command, argument))
+        print(payload.outcome(done).decode() if as_json else done.answer)
         return
     with connected(plant, err.print) as client:
         answer = client.requests.control(line_of(plant, device).name, device, command, argument)
+    if as_json:
+        print(json.dumps(answer))
+        if "error" in answer:
+            sys.exit(error_code(answer))
+        return
     if "error" in answer:
         end(outcome(device, answer), error_code(answer))
     print(printable(str(answer["answer"])))

@@ -1,13 +1,15 @@
 """The `notify` command: a test of the ways on which alarms reach people."""
 
 import asyncio
+import json
+import sys
 import time
 from typing import Annotated
 
 import typer
 
 from gateway.cli.progress import loaded
-from gateway.cli.terminal import FAILED, ConfigPath, end, err, out, printable
+from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
 from gateway.errors import ConfigError
 
 
@@ -16,6 +18,7 @@ def notify(
     ways: Annotated[
         list[str] | None, typer.Argument(metavar="[WAY]...", help="mail, webhook, boss@plant ...")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Send a test message on each way of `notify:`, or on some, from this machine."""
     from gateway.parts.notify.message import message
@@ -32,16 +35,16 @@ def notify(
         raise ConfigError(f"no rule of notify uses {unknown[0]}: there are {', '.join(known)}")
     test = message(plant.zenoh.prefix, plant.name, [TEST], time.time_ns(), settings.language)
 
-    async def send() -> list[str]:
-        failed = list[str]()
-        for way in ways or known:
-            if why := await why_not_sent(known[way], test):
-                failed.append(f"{way}: {why}")
-            else:
-                out.print(f"{way}: sent")
-        return failed
+    async def send() -> dict[str, str]:
+        return {way: await why_not_sent(known[way], test) for way in ways or known}
 
-    if failed := asyncio.run(send()):
-        for one in failed[:-1]:
-            err.print(printable(one))
-        end(printable(failed[-1]), FAILED)
+    tried = asyncio.run(send())
+    for way, why in tried.items():
+        if as_json:
+            print(json.dumps({"way": way, "sent": not why, "why": why}))
+        elif why:
+            err.print(printable(f"{way}: {why}"))
+        else:
+            out.print(f"{way}: sent")
+    if any(tried.values()):
+        sys.exit(FAILED)

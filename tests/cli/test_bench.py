@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -298,6 +299,7 @@ async def test_from_an_unknown_line_to_twenty_tags_on_zenoh_in_a_browser(tmp_pat
     ):
         page = BenchPage(tab)
         await tab.look(1366, 900)
+        began = time.monotonic()
         await page.named(await addresses.get())
         assert await tab.value("location.hash") == ""
         assert not path.exists()
@@ -305,6 +307,7 @@ async def test_from_an_unknown_line_to_twenty_tags_on_zenoh_in_a_browser(tmp_pat
         await tab.until(f"/→\\n?.*[1-9]/s.test({shown('#loads')})")
         await page.click("#apply", f"{shown('#good')} === '20 of 20 values are good'")
         assert page.clicks == 5
+        print(f"20 values after {time.monotonic() - began:.1f} s")  # shown by `pytest -rP`
         config = load(path)
         assert [tag.origin.word for tag in config.devices[0].tags] == ["simulated"] * 20
 
@@ -337,4 +340,14 @@ async def test_from_an_unknown_line_to_twenty_tags_on_zenoh_in_a_browser(tmp_pat
         await tab.until(f"{shown('#good')} === '20 of 20 values are good'")
         assert api.trial.said == "The file is as before."
         await tab.until(f"{shown('#said')} === 'The file is as before.'")
+        # Of a second line the page shows the first new station, not the one before.
+        await tab.value("document.getElementById('protocol').value = 'modbus-rtu'")
+        await page.click("#simulate", "!document.getElementById('stations-form').hidden")
+        await tab.value(
+            "[...document.querySelectorAll('#found li')].forEach("
+            "(row, number) => { row.name.value = `drive-${number}`; });"
+            " document.getElementById('line-name').value = 'hall-2'"
+        )
+        shown_device = "document.getElementById('device').value"
+        await page.click("#stations-form .main", f"{shown_device} === 'drive-0'")
         assert tab.errors == []

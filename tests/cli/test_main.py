@@ -15,7 +15,9 @@ from gateway import __version__
 from gateway.cli.examples import EXAMPLES
 from gateway.cli.main import cli
 from gateway.config import schema as config_schema
-from tests.cli.conftest import Command
+from gateway.contract.documents.catalogue import FILE
+from tests.cli.conftest import Command, documents
+from tests.contract.reader import Reader
 from tests.e2e.processes import Done, plc_gateway
 
 ROOT = Path(__file__).parents[2]
@@ -173,6 +175,32 @@ def test_without_a_gateway_commands_end_with_1(
     assert "no gateway at tcp/127.0.0.1:" in done.err
     assert "start it with `plc-gateway run`, or use --direct" in done.err
     assert len(done.err.splitlines()) == 1
+
+
+def test_the_documents_of_commands_have_the_schemas_of_the_contract(
+    command: Command, running: Path
+) -> None:
+    reader = Reader(json.loads(FILE.read_text("utf-8")), "plant")
+
+    def fit(name: str, *found: dict[str, Any]) -> None:
+        assert found
+        assert [reader.violations(name, one) for one in found] == [[]] * len(found)
+
+    def said(*arguments: object) -> list[dict[str, Any]]:
+        return documents(command(*arguments, "--json").out)
+
+    def without_tag(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{name: one for name, one in row.items() if name != "tag"} for row in rows]
+
+    fit("value", *without_tag(said("read", running)))
+    fit("meta", *without_tag(said("export", running)))
+    fit("write", *said("write", running, "mixer/trim", "3"))
+    fit("group", *said("write", running, "mixer", "trim=3", "offset=1"))
+    fit("status", *said("health", running))
+    fit("alarm", *json.loads(command("alarms", running, "--all", "--json").out))
+    [status] = said("status", running)
+    for path, document in status.items():
+        fit(path.partition("/")[0], document)
 
 
 def test_status_and_health_import_no_protocol(running: Path) -> None:

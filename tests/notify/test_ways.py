@@ -189,6 +189,17 @@ async def test_a_webhook_that_is_not_answered_by_success_is_not_sent(
         await _answered(tmp_path, refuse)
 
 
+async def test_the_url_of_a_webhook_is_in_no_error(tmp_path: Path) -> None:
+    """It may hold a secret, as those of chats do, and the error is in `status` and the log."""
+
+    async def refuse(_request: web.Request) -> web.Response:
+        return web.Response(headers={"x": "y" * 10_000})
+
+    with pytest.raises(GatewayError, match="no HTTP") as raised:
+        await _answered(tmp_path, refuse)
+    assert "127.0.0.1" not in str(raised.value)
+
+
 def test_a_message_reaches_a_broker(tmp_path: Path) -> None:
     port = free_port()
     broker = ("mosquitto", "-p", port, "-v")

@@ -61,8 +61,8 @@ async def _run(api: BenchApi, at: int) -> None:
     for task in (serving, stopping):
         task.cancel()
     await asyncio.gather(serving, stopping, return_exceptions=True)
-    for task in done:
-        task.result()
+    for ended in done:
+        ended.result()
 
 
 async def serve(api: BenchApi, at: int, tell: Callable[[str], None]) -> None:

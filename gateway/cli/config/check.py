@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -60,13 +60,11 @@ def check(
         return
     with progress(err) as report:
         loaded = load(config, report)
-        warnings = zenoh_warnings(loaded) + exposure.check(loaded) + _open_to_all(loaded)
-        warnings += _may_change_places(loaded)
         lines = forecasts(loaded, report)
-    warnings += [*door_warnings(loaded, lines), *_too_large(loaded)]
-    by_name = {line.name: line for line in loaded.lines}
-    warnings += [text for one in lines for text in modem_warnings(by_name[one.name], one)]
-    warnings = [*(line.advice() for line in lines if line.overloaded), *warnings]
+    coded = [
+        {"code": code, "text": text} for code, texts in _warnings(loaded, lines) for text in texts
+    ]
+    warnings = [one["text"] for one in coded]
     notes, errors = [*_notes(loaded)], [*_unwritable(loaded)]
     if port:
         from gateway.cli.config.port_check import port_sentences  # it loads serialx
@@ -74,7 +72,7 @@ def check(
         good, bad = port_sentences(loaded.lines)
         notes, errors = [*good, *notes], [*bad, *errors]
     if as_json:
-        found = {"notes": notes, "warnings": warnings, "errors": errors}
+        found = {"notes": notes, "warnings": warnings, "errors": errors, "coded": coded}
         print(json.dumps({"file": str(config), "lines": [*map(_document, lines)], **found}))
     else:
         few = sum(len(line.blocks) for line in lines) <= 100
@@ -90,6 +88,19 @@ def check(
         print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _warnings(config: Config, lines: Sequence[LineForecast]) -> Iterator[tuple[str, Iterable[str]]]:
+    """Yields the warnings by code: docs/codes.md."""
+    by_name = {line.name: line for line in config.lines}
+    yield "overloaded", (line.advice() for line in lines if line.overloaded)
+    yield "zenoh", zenoh_warnings(config)
+    yield "page-exposed", exposure.check(config)
+    yield "port-exposed", _open_to_all(config)
+    yield "port-counted", _may_change_places(config)
+    yield "door", door_warnings(config, lines)
+    yield "disk-fills", _too_large(config)
+    yield "calls", (text for one in lines for text in modem_warnings(by_name[one.name], one))
 
 
 def _document(line: LineForecast) -> dict[str, object]:

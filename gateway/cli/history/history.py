@@ -3,20 +3,21 @@
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from gateway.cli.client.arguments import matches, wanted_keys
-from gateway.cli.history.history_files import Column, new_file, write_csv, writer_of
+from gateway.cli.history.history_files import Column, new_file, write_csv, write_json, writer_of
 from gateway.cli.progress import busy, counted, loaded
-from gateway.cli.terminal import ConfigPath, TagNames, err
+from gateway.cli.terminal import AsJson, ConfigPath, TagNames, err
 from gateway.config import Config
 from gateway.contract.past.buckets import Now
 from gateway.contract.past.history_query import HistoryQuery, question
 from gateway.contract.past.timerange import TimeRange, time_range
-from gateway.errors import Damaged, GatewayError
+from gateway.errors import ConfigError, Damaged, GatewayError
 from gateway.parts.history.answers.bucket_search import BucketSearch
 from gateway.parts.history.answers.search import Search
 from gateway.parts.history.files.aside import asides, rename
@@ -68,8 +69,11 @@ def export(
     decimal_comma: Annotated[
         bool, typer.Option("--decimal-comma", help="0,1 and ; as German or French Excel reads it")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Export samples of the history file. The gateway may run, or not."""
+    if as_json and output is not None:
+        raise ConfigError("--json prints the samples: leave out --output")
     plant = loaded(config)
     given = {"time": period, "bucket": bucket, "agg": agg, "quality": quality}
     asked = question({name: text for name, text in given.items() if text is not None}, "time")
@@ -84,12 +88,12 @@ def export(
             rows = _samples(search, found, asked, asked_period, now, lost)
         else:
             rows = _buckets(course, found, asked, asked_period, now, lost)
+        printed = write_json if as_json else partial(write_csv, comma=decimal_comma)
         if output is None and sys.stdout.isatty():
-            write_csv(sys.stdout, columns, rows, comma=decimal_comma)
+            printed(sys.stdout, columns, rows)
         elif output is None:
             with busy("reading") as report:
-                shown = counted(rows, "rows exported", report)
-                write_csv(sys.stdout, columns, shown, comma=decimal_comma)
+                printed(sys.stdout, columns, counted(rows, "rows exported", report))
         else:
             write = writer_of(output, columns, comma=decimal_comma)
             with busy("reading") as report, new_file(output) as unfinished:

@@ -43,6 +43,19 @@ def write_csv(stream: TextIO, columns: Sequence[Column], rows: Rows, *, comma: b
     return count
 
 
+def write_json(stream: TextIO, columns: Sequence[Column], rows: Rows) -> int:
+    """Writes a document for each row; returns their number."""
+    count = 0
+    for row in rows:
+        cells = {
+            column.name: rfc3339(cell) if column.kind == "time" else cell
+            for column, cell in zip(columns, row, strict=True)
+        }
+        stream.write(json.dumps(cells) + "\n")
+        count += 1
+    return count
+
+
 def _cell(value: Value | None, is_time: bool, comma: bool) -> object:
     match value:
         case None:

@@ -15,7 +15,8 @@ from gateway.cli.line.logs import LogFormat, LogLevel, set_up
 from gateway.cli.line.peek import SettingOption
 from gateway.cli.line.recorded_line import Log, line_of_file, line_of_protocols
 from gateway.cli.line.simulate import tcp_address
-from gateway.cli.terminal import FAILED, printable
+from gateway.cli.tables import print_rows, row_of
+from gateway.cli.terminal import FAILED, AsJson, printable
 from gateway.cli.trace import clock
 from gateway.config import LineConfig
 from gateway.ending import stop_event
@@ -27,6 +28,8 @@ from gateway.protocols.listening import Listenable
 from gateway.simulator.recorded import Answered, OtherStations, RecordedStation, RecordedValues
 from gateway.simulator.serve import serve_on_pty, serve_on_tcp
 from gateway.stations.station import Station
+
+Show = Callable[[Learned], None]
 
 
 def replay(
@@ -56,11 +59,13 @@ def replay(
     tcp: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve it on TCP instead.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Decode a recording: the values of each reply, with its time. Sends nothing.
 
     Without --config each address has its own name, as the PLC has it.
     """
+    show = _print_json if as_json else _print
     log = Log(logs, line)
     if config is None:
         of = line_of_protocols(log, protocol or [], setting or [])
@@ -77,19 +82,19 @@ def replay(
                 if isinstance(entry, LoggedPiece):
                     capture.add(entry.at or 0.0, entry.way, entry.data)
     elif config is None:
-        _decode(of, log, check=check)
+        _decode(of, log, check=check, show=show)
     else:
-        _compare(of, log.entries(), check=check)
+        _compare(of, log.entries(), check=check, show=show)
 
 
-def _decode(line: LineConfig, log: Log, *, check: bool) -> None:
+def _decode(line: LineConfig, log: Log, *, check: bool, show: Show) -> None:
     if check:
         raise ConfigError("--check needs --config: the names of the values are in the file")
     events = (one for one in Replay(line).run(timed(log.entries())) if isinstance(one, Learned))
     learned = False
     for event in events:
         learned = True
-        _print(event)
+        show(event)
     if not learned:
         raise GatewayError(
             "nothing was learned: no reply belongs to its request for certain. Is there another "
@@ -97,7 +102,9 @@ def _decode(line: LineConfig, log: Log, *, check: bool) -> None:
         )
 
 
-def _compare(line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, check: bool) -> None:
+def _compare(
+    line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, check: bool, show: Show
+) -> None:
     replayed = Replay(line)
     for event in replayed.run(log):
         if isinstance(event, Difference):
@@ -105,7 +112,7 @@ def _compare(line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, chec
             now = json.dumps(event.learned, ensure_ascii=False)
             print(f"{clock(at)} {tag}: {json.dumps(value, ensure_ascii=False)} recorded, {now} now")
         elif not check:
-            _print(event)
+            show(event)
     checked = replayed.checked
     print(
         f"{checked.equal} values as recorded, {checked.different} others, "
@@ -121,6 +128,10 @@ def _compare(line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, chec
 def _print(event: Learned) -> None:
     for text in _lines(event):
         print(printable(text))
+
+
+def _print_json(event: Learned) -> None:
+    print_rows([row_of(sample) for sample in event.samples], {}, as_json=True)
 
 
 def _lines(event: Learned) -> Iterator[str]:

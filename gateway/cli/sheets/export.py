@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ import typer
 
 from gateway.cli.client import matches, wanted_keys
 from gateway.cli.progress import loaded
-from gateway.cli.terminal import ConfigPath, TagNames
+from gateway.cli.terminal import AsJson, ConfigPath, TagNames
 from gateway.config.sheets import neutral
 from gateway.config.transfers.ranges import is_range
 from gateway.contract.meta import meta_fields
@@ -37,26 +38,32 @@ def export(
     decimal_comma: Annotated[
         bool, typer.Option("--decimal-comma", help="0,1 and ; as German or French Excel reads it")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Export tags as a sheet: keys, types, units and limits, as `@meta` has them."""
     plant = loaded(config)
     wanted = wanted_keys(plant, tags)
     ranges = {rule.source for rule in plant.transfers if is_range(rule.text[0])}
-    rows = [
-        _row(plant.zenoh.prefix, tag)
+    found = [
+        tag
         for device in plant.devices
         for tag in device.tags
         if matches(tag.key, wanted) and tag.key not in ranges
     ]
-    text = table(rows, decimal_comma=decimal_comma)
+    if as_json:
+        text = "".join(f"{json.dumps({'tag': one.key, **meta_fields(one)})}\n" for one in found)
+    else:
+        rows = [_row(plant.zenoh.prefix, one) for one in found]
+        text = table(rows, decimal_comma=decimal_comma)
     if output is None:
         sys.stdout.write(text)
         return
     try:
-        output.write_bytes(text.encode("utf-8-sig"))  # with the mark Excel shows °C
+        # With the mark Excel shows °C.
+        output.write_bytes(text.encode("utf-8" if as_json else "utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{output} cannot be written: {error.strerror}") from None
-    print(f"{output}: {len(rows)} tags of {config}")
+    print(f"{output}: {len(found)} tags of {config}")
 
 
 def table(rows: list[dict[str, object]], *, decimal_comma: bool) -> str:

@@ -134,6 +134,10 @@ class _Webhook:
             ):
                 if not 200 <= answer.status < 300:
                     raise GatewayError(f"the server answers {answer.status} {answer.reason}")
+        except aiohttp.ClientResponseError:  # its text has the URL, which may hold a secret
+            raise GatewayError("the server answers something that is no HTTP") from None
+        except aiohttp.InvalidURL:
+            raise GatewayError("notify.webhook.url is no address") from None
         except (aiohttp.ClientError, OSError, ValueError) as error:
             raise GatewayError(said(error)) from None
 
