@@ -203,7 +203,7 @@ READY = {
     "lines": f'{LIVE} && document.querySelectorAll("#lines-list li").length',
     "alarms": f'{LIVE} && document.querySelectorAll("#alarms-list li").length',
     "trend": 'document.querySelector("#chart canvas") && '
-    '/\\d:\\d/.test(document.getElementById("trend-text").textContent)',
+    '/\\d/.test(document.getElementById("trend-text").textContent)',
 }
 READY["search"] = READY["tags"]
 
