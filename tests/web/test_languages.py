@@ -161,8 +161,10 @@ async def test_the_whole_page_is_small_over_the_wire() -> None:
     files = {one.name for one in ASSETS["page"][0].iterdir()} - {"page.html"} | {"", "catalogue.js"}
     async with serving() as client:
         for language in LANGUAGES:
-            asked = {"Accept_Encoding": "gzip", "Accept_Language": language}
-            answers = [await client.ask(f"/{one}", **asked) for one in files]
+            answers = [
+                await client.ask(f"/{one}", Accept_Encoding="gzip", Accept_Language=language)
+                for one in files
+            ]
             assert {one.status for one in answers} == {200}
             assert sum(len(one.body) for one in answers) < 120_000  # measured: 77,000
 
