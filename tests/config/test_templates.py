@@ -196,6 +196,7 @@ def test_a_mistake_in_a_file_of_templates_has_that_file(tmp_path: Path) -> None:
             "p.bas: no parameter of pump, and no setting of a vigor device: did you mean base?",
         ),
         ("{use: pump, base: {base}, station: 3}", "p.base: a mapping is no value: write a number"),
+        ("{use: pump, base: null, station: 3}", "p.base: nothing is no value: write a number"),
         ("{use: pump, base: 1, repeat: 3}", "p.repeat: the name needs the number too: p-{n}"),
         ("{use: pump, base: 1, repeat: 0}", "p.repeat: 0 is no count from 1 to 10000"),
         ("{use: pump, base: 1, repeat: x}", "p.repeat: 'x' is no count from 1 to 10000"),
@@ -377,6 +378,14 @@ def test_data_of_cpu_link_are_those_of_the_manual(tmp_path: Path, mode: int) -> 
     assert {address: tag.name for address, tag in found.items()} == expected
     three = shipped(tmp_path, f"vigor/cpu-link-mode-{mode}", f"{VIGOR}, stations: 3")
     assert set(three) == {a for text in manual.CPU_LINK_DATA[mode][:3] for a in ranges(text)}
+
+
+@pytest.mark.parametrize("mode", [1, 2, 3])
+def test_a_cpu_link_with_a_ninth_station_is_refused(tmp_path: Path, mode: int) -> None:
+    """The registers behind those of the eighth belong to the program of the PLC."""
+    for stations in (0, 9, 17, 18, 1000):
+        with pytest.raises(ConfigErrors, match="is no count from 1"):
+            shipped(tmp_path, f"vigor/cpu-link-mode-{mode}", f"{VIGOR}, stations: {stations}")
 
 
 @pytest.mark.parametrize("speed", ["normal", "high-speed"])

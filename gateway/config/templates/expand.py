@@ -208,7 +208,7 @@ class _Expansion:
         values, missing = dict(counter), False
         declared = {name: t for t in templates for name in t.parameters}
         for name in declared:
-            if isinstance(own.get(name), (dict, list)):
+            if isinstance(own.get(name, 0), dict | list | None):
                 what = f"{shown(own[name])} is no value: write a number or a text, in quotes"
                 self._filler.note(at.inside(name), what)
             elif name in own:
