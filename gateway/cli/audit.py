@@ -34,6 +34,8 @@ def audit(
             elif first <= record.time <= last:
                 shown = {"n": record.number, "time": record.time, **_fields(record.event)}
                 sys.stdout.write(json.dumps(shown) + "\n")
+    except BrokenPipeError:  # `| head`
+        raise
     except OSError as error:
         raise GatewayError(f"{path} cannot be read: {error.strerror}") from None
     if broken:

@@ -2,12 +2,16 @@
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import orjson
 import pytest
 
 from gateway.parts.audit.file import OLDER, AuditFile, Event, checked, read
+from tests.e2e.processes import vigor_line, write_config
+from tests.zenoh_peer import free_endpoint
 
 NOON = 1_795_262_400 * 10**9
 
@@ -108,3 +112,18 @@ def test_a_write_that_fails_leaves_no_half_record(tmp_path: Path) -> None:
     file.append(events(2, 3))
     assert values(path) == list(range(5))
     assert broken(path) == []
+
+
+def test_the_audit_ends_quietly_with_its_reader(tmp_path: Path) -> None:
+    """As in `plc-gateway audit … | head -1`."""
+    config = write_config(
+        tmp_path / "plant.yaml",
+        free_endpoint(),
+        {"hall": vigor_line("simulator", {})},
+        gateway={"name": "demo", "audit": "audit.jsonl"},
+    )
+    AuditFile(tmp_path / "audit.jsonl").append(events(5_000))
+    audit = f"{sys.executable} -m gateway audit {config} | head -n 1"
+    done = subprocess.run(["sh", "-c", audit], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["value"] == 0
+    assert done.stderr == ""
