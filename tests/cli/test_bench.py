@@ -199,6 +199,19 @@ async def test_a_bench_that_was_killed_leaves_a_question_to_the_next(path: Path)
     assert path.read_text() == HUMAN == running.taken[-1]
 
 
+async def test_another_bench_of_the_file_takes_no_way_back(path: Path) -> None:
+    one, other = (Trial(changed(path), PlainRunning(path)) for _ in range(2))
+    await one.apply()
+    with pytest.raises(ConfigError, match="another bench tries a change"):
+        await other.apply()
+    await other.close()
+    await one.back()
+    assert path.read_text() == HUMAN
+    assert one.said == "The file is as before."
+    await other.apply()
+    await other.keep()
+
+
 async def test_a_file_that_the_gateway_refuses_is_as_before_at_once(path: Path) -> None:
     running = PlainRunning(path, refuses="D100")
     trial = Trial(changed(path), running)

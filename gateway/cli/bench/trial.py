@@ -150,8 +150,15 @@ class Trial:
             write_new(draft.path, text)
         else:
             try:
+                self._before.touch(exist_ok=False)
                 shutil.copy2(draft.path, self._before)
+            except FileExistsError:
+                raise ConfigError(
+                    f"another bench tries a change of {draft.path.name}: keep it, or go back, there"
+                ) from None
             except OSError as error:
+                with suppress(OSError):  # a full disk took a part of it
+                    self._before.unlink()
                 raise ConfigError(f"{self._before} cannot be written: {error.strerror}") from None
             try:
                 replace(
