@@ -109,7 +109,7 @@ def _place(form: FormOf, span: Span, late: Hashable) -> tuple[Sequence[Span], Se
         for found, at in ((begin, start), (end, start + size - units)):
             read = Span(area, at, units)
             shape = form(read)
-            if shape is not None and shape != late and len(found) < MOST_FORMS:
+            if shape is not None and shape != late:
                 found.setdefault(shape, read)
         if len(begin) == MOST_FORMS:
             break
