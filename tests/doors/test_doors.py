@@ -367,6 +367,22 @@ async def test_programs_give_way_while_polls_are_lost() -> None:
 
 
 @on_virtual_time
+async def test_a_door_that_waits_for_its_share_holds_up_no_other_door() -> None:
+    """Its program had the turn of the line while it waited, and those of other doors waited too."""
+    small = door("hall", "modbus-tcp", most="1%", reply_within="10s")
+    large = {**door("hall", "modbus-tcp", most="90%"), "listen": "127.0.0.1:1503"}
+    async with opened(small, panel=large) as hall:
+        assert hall.second is not None
+        greedy, panel = [Program(hall.door) for _ in range(3)], Program(hall.second)
+        for one in greedy:
+            for number in range(20):
+                one.guest.received(tcp("03 0064 0001", number=number))
+        await asyncio.sleep(3)
+        for _ in range(10):
+            assert len(await panel.ask(tcp("03 0064 0001"), wait=0.5)) == 7 + 4
+
+
+@on_virtual_time
 async def test_a_read_that_needs_several_requests_costs_them_all() -> None:
     """It was free: programs took two thirds of the wire with `most: 5%`."""
     press = {**PRESS, "max_read_words": 10}

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 
 from gateway.contract.interfaces import North
-from gateway.errors import BadValue, Busy, GatewayError, Offline, Refused
+from gateway.errors import BadValue, Busy, GatewayError, Offline, Refused, Unclear
 from gateway.parts.doors.settings import Door
 from gateway.parts.doors.stores import Step
 from gateway.plant.any_address import AnyAddress
@@ -35,6 +35,7 @@ class GuestRequests:
         self._any = any_address
         self._north = north
         self._turn = asyncio.Lock()
+        self._turns = dict[str, asyncio.Lock]()  # of each door
         # By the loop's clock: when the share of each door allows its next request; of all: "".
         self._free_at = dict[str, float]()
         self._late_at = dict[str, float]()  # the same while polls are late
@@ -48,38 +49,51 @@ class GuestRequests:
             return known
         loop = asyncio.get_running_loop()
         ends = loop.time() + within
-        try:
-            async with asyncio.timeout(within):
-                await self._turn.acquire()
-        except TimeoutError:
+        turn = self._turns.setdefault(door.name, asyncio.Lock())
+        if not await _acquired(turn, ends):
             return NOT_NOW
         try:
-            self._spend_resync(step.device)
-            free_at = max(self._free_at.get(name, 0.0) for name in (door.name, ""))
-            if free_at > ends:
+            if not await self._begin(step.device, door, ends):
                 return NOT_NOW
-            await asyncio.sleep(free_at - loop.time())
-            if self._any.is_late(step.device):
-                late_at = max(self._late_at.get(name, 0.0) for name in (door.name, ""))
-                wait = late_at - loop.time()
-                await asyncio.sleep(min(wait, (ends - loop.time()) / 2))  # the reply is in time
             left = ends - loop.time()
             before = self._any.requested(step.device)
             try:
                 return await (self._write if step.writes else self._read)(step, door, by, left)
             finally:
                 self._spend(self._any.requested(step.device) - before, door)
+                self._turn.release()
         except Refused as error:
             return Rejected(error.code)
         except BadValue:
             return Denied(Why.NO_TAG)
         except Busy:
             return NOT_NOW
-        except GatewayError:
+        except Unclear:
             self._unclear = door, self._any.resyncs(step.device)
             return NO_REPLY
+        except GatewayError:
+            return NO_REPLY
         finally:
-            self._turn.release()
+            turn.release()
+
+    async def _begin(self, device: str, door: Door, ends: float) -> bool:
+        """Waits until the shares allow a request, and takes the turn of the line. Returns False if
+        that is too late. A door that waits for its own share holds up no other."""
+        now = asyncio.get_running_loop().time
+        while True:
+            self._spend_resync(device)
+            free_at = max(self._free_at.get(name, 0.0) for name in (door.name, ""))
+            if free_at > ends:
+                return False
+            await asyncio.sleep(free_at - now())
+            if self._any.is_late(device):
+                late_at = max(self._late_at.get(name, 0.0) for name in (door.name, ""))
+                await asyncio.sleep(min(late_at - now(), (ends - now()) / 2))  # it is in time
+            if not await _acquired(self._turn, ends):
+                return False
+            if self._free_at.get("", 0.0) <= now():
+                return True
+            self._turn.release()  # another door has used the share of all
 
     def _known(self, step: Step, max_age: float) -> Mapping[Cell, int]:
         """Returns what polls have read in the last `max_age` seconds; empty: not all of it."""
@@ -147,3 +161,13 @@ class GuestRequests:
     def share(self, now: float) -> float:
         """Returns the share of the wire time in the last minute."""
         return self._share * math.exp((self._shared_at - now) / _MINUTE)
+
+
+async def _acquired(lock: asyncio.Lock, ends: float) -> bool:
+    """Returns False if the lock was not free until `ends`."""
+    try:
+        async with asyncio.timeout_at(ends):
+            await lock.acquire()
+    except TimeoutError:
+        return False
+    return True
