@@ -39,6 +39,7 @@ from gateway.transport.port import (
     Rfc2217Address,
     SerialPath,
     TcpAddress,
+    UdpAddress,
     named,
 )
 
@@ -110,6 +111,9 @@ def _port(port: PortAddress, line: LineConfig, *, runs: bool) -> Iterator[Findin
             yield from _port(below, line, runs=runs)
         case SerialPath(path):
             yield from _serial(path, runs=runs)
+        case UdpAddress(host, number):
+            says = "not tried: a port udp:// shows by its first reply that a device is there"
+            yield Finding(named(host, number), says)
         case TcpAddress(host, number) | Rfc2217Address(host, number) if not line.serve:
             yield _tried(port, runs, lambda: _connected(port), f"ping {host}")
         case TcpAddress(host, number) | ListenAddress(host, number):

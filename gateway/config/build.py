@@ -39,7 +39,13 @@ from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS, fault_of
 from gateway.tags import Tag
 from gateway.tags.tag import READ, NotReal
-from gateway.transport.port import ListenAddress, ModemAddress, SerialPath, SimulatorAddress
+from gateway.transport.port import (
+    ListenAddress,
+    ModemAddress,
+    SerialPath,
+    SimulatorAddress,
+    UdpAddress,
+)
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 AUDIT_FILE = FilePath("audit.jsonl")
@@ -295,11 +301,14 @@ class Builder:
             if isinstance(line.port, SimulatorAddress | ListenAddress):
                 continue
             port = line.port.port if isinstance(line.port, ModemAddress) else line.port
-            places: list[object] = (
-                [realpath(port.path)]
-                if isinstance(port, SerialPath)
-                else [(port.host, port.port), *port.reach.others]
-            )
+            places: list[object]
+            match port:
+                case SerialPath(path):
+                    places = [realpath(path)]
+                case UdpAddress():
+                    places = [port]
+                case _:
+                    places = [(port.host, port.port), *port.reach.others]
             others = [ports.setdefault(place, line.name) for place in places]
             if other := next((one for one in others if one != line.name), ""):
                 self.mistakes.add(

@@ -3,7 +3,13 @@
 from collections.abc import Sequence
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.port_rules import check_connection, check_heartbeat, check_tls, direction
+from gateway.config.port_rules import (
+    check_connection,
+    check_datagrams,
+    check_heartbeat,
+    check_tls,
+    direction,
+)
 from gateway.config.settings.model import LineSection
 from gateway.config.settings.modem_settings import ModemSection
 from gateway.engine.device.device_settings import DeviceSettings
@@ -20,6 +26,7 @@ from gateway.transport.port import (
     SerialSettings,
     SimulatorAddress,
     TcpAddress,
+    UdpAddress,
 )
 
 DIALS_IDLE, ANSWERS_IDLE = 5.0, 60.0  # seconds without an exchange until a call is ended
@@ -42,6 +49,7 @@ def check_line(
         _check_listening(line, devices, path, mistakes)
     check_connection(line, devices, path, mistakes)
     check_tls(line, devices, path, mistakes)
+    check_datagrams(line, devices, path, mistakes)
     check_heartbeat(line, devices, path, mistakes)
     for device in devices:
         driver, place = device.driver, (*path, "devices", device.name)
@@ -178,11 +186,11 @@ def _check_network(
     mistakes: Mistakes,
 ) -> None:
     protocol = device.driver.protocol
-    if not isinstance(line.port, (TcpAddress, ListenAddress, SimulatorAddress)):
+    if not isinstance(line.port, TcpAddress | UdpAddress | ListenAddress | SimulatorAddress):
         mistakes.add(
             (*path, "protocol"),
-            f"{protocol} needs a port tcp://host:port or listen://host:port: it does not run on a "
-            "serial line",
+            f"{protocol} needs a port tcp://host:port, udp://host:port or listen://host:port: it "
+            "does not run on a serial line",
         )
     serial = [other for other in devices if not other.driver.traits.over_network]
     if serial:

@@ -19,6 +19,7 @@ from gateway.transport.port import (
     SerialPath,
     TcpAddress,
     TlsConfig,
+    UdpAddress,
 )
 from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
@@ -158,6 +159,29 @@ def check_connection(
         if short < 2 * delay:
             text = f"{device.name} has an interval of {short:g} s, and each round waits {delay:g} s"
             mistakes.add(place, f"{text} (connect_delay): write every: {2 * delay:g}s or more")
+
+
+def check_datagrams(
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """A datagram may arrive twice, late, or after a later one. Only numbered frames can be told
+    apart then, and a write could be done again after a newer one."""
+    if not isinstance(line.port, UdpAddress):
+        return
+    if line.serve:
+        mistakes.add((*path, "port"), "a served line has a port tcp://: datagrams have no master")
+    for device in devices:
+        place = (*path, "devices", device.name)
+        if not device.driver.traits.over_network:
+            text = f"{device.driver.protocol} has no number in its frames, and datagrams may change"
+            mistakes.add((*place, "protocol"), f"{text} their order: only modbus-tcp has udp://")
+        for name in [tag.name for tag in device.tags if tag.write is not None]:
+            text = "a port udp:// only reads, because a datagram may arrive twice or late, and an "
+            text += "old write would be done after a newer one: remove `write`, or use tcp://"
+            mistakes.add((*place, "tags", name, "write"), text)
+        if device.control:
+            text = "a port udp:// only reads, because a datagram may arrive twice or late: use "
+            mistakes.add((*place, "control"), f"{text}tcp://, or remove `control`")
 
 
 def direction(line: LineSection, path: Path, mistakes: Mistakes) -> Rs485 | None:

@@ -1,4 +1,4 @@
-"""Ports: serial, TCP and RFC 2217, opened by `open_port`, and modems on them by `open_modem`."""
+"""Ports: serial, TCP, UDP and RFC 2217 by `open_port`, and modems on them by `open_modem`."""
 
 from collections.abc import Awaitable, Callable
 from importlib import import_module
@@ -17,6 +17,7 @@ from gateway.transport.port import (
     SerialSettings,
     SimulatorAddress,
     TcpAddress,
+    UdpAddress,
     named,
     parse_port,
 )
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _OPENERS = {
     SerialPath: "serial_port",
     TcpAddress: "tcp",
+    UdpAddress: "udp",
     ListenAddress: "device_servers",
     Rfc2217Address: "rfc2217",
     ModemAddress: "modem",
@@ -59,6 +61,10 @@ async def open_port(
             from gateway.transport.tcp import open_tcp
 
             return await open_tcp(where, receiver, timeout=timeout, baudrate=settings.baudrate)
+        case UdpAddress():
+            from gateway.transport.udp import open_udp
+
+            return await open_udp(where, receiver, timeout=timeout)
         case Rfc2217Address():
             from gateway.transport.rfc2217 import open_rfc2217
 

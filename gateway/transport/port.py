@@ -102,6 +102,14 @@ class TcpAddress:
 
 
 @dataclass(frozen=True, slots=True)
+class UdpAddress:
+    """A device with a network port that takes datagrams: `udp://host:port`."""
+
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
 class Rfc2217Address:
     """A device server that accepts baud rate and format: `rfc2217://host:port`."""
 
@@ -181,7 +189,13 @@ class SimulatorAddress:
 
 
 PortAddress = (
-    SerialPath | TcpAddress | Rfc2217Address | ListenAddress | ModemAddress | SimulatorAddress
+    SerialPath
+    | TcpAddress
+    | UdpAddress
+    | Rfc2217Address
+    | ListenAddress
+    | ModemAddress
+    | SimulatorAddress
 )
 
 
@@ -196,7 +210,9 @@ class SerialSettings:
 
 LONGEST_REGISTRATION = 256  # bytes
 MODEM = "modem:"
-_URL = re.compile(r"(tcp|tls|rfc2217|listen)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
+_URL = re.compile(
+    r"(tcp|tls|udp|rfc2217|listen)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z"
+)
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
@@ -206,7 +222,7 @@ def parse_port(text: str) -> PortAddress:
         return SimulatorAddress()
     if text.startswith(MODEM):
         below = parse_port(text.removeprefix(MODEM))
-        if isinstance(below, ListenAddress | ModemAddress | SimulatorAddress):
+        if not isinstance(below, SerialPath | TcpAddress | Rfc2217Address):
             raise ConfigError(f"{text!r} is not a modem: write its port, such as modem:/dev/ttyS0")
         return ModemAddress(below)
     if match := _URL.match(text):
@@ -215,13 +231,15 @@ def parse_port(text: str) -> PortAddress:
             raise ConfigError(f"port number {port} is not 1..65535")
         if scheme == "listen":
             return ListenAddress(host, port)
+        if scheme == "udp":
+            return UdpAddress(host, port)
         if scheme == "rfc2217":
             return Rfc2217Address(host, port)
         return TcpAddress(host, port, TlsConfig() if scheme == "tls" else None)
     if _SCHEME.match(text) or not text.strip() or text != text.strip():
         raise ConfigError(
             f"{text!r} is not a port: write a path such as /dev/ttyUSB0, "
-            "tcp://host:port, tls://host:port, rfc2217://host:port, listen://host:port, "
-            "modem:/dev/ttyS0, or simulator"
+            "tcp://host:port, tls://host:port, udp://host:port, rfc2217://host:port, "
+            "listen://host:port, modem:/dev/ttyS0, or simulator"
         )
     return SerialPath(text)

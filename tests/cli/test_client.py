@@ -169,7 +169,7 @@ def answering(
         "mode": "peer",
         "listen/endpoints": list(config.zenoh.listen),
         "scouting/multicast/enabled": False,
-        # Microseconds: Zenoh drops a put after 1 ms on a full link, and a busy machine needs longer.
+        # Microseconds: Zenoh drops a put after 1 ms on a full link. A busy machine needs longer.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,
         **{f"transport/auth/usrpwd/{name}": value for name, value in more.items()},
     }

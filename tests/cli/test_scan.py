@@ -213,7 +213,7 @@ async def test_a_lost_port_ends_the_scan() -> None:
         ({"protocol": "frames"}, "scan cannot look for frames: use one of vigor, "),
         ({"protocol": "profibus"}, "scan cannot look for profibus"),
         ({"port": "simulator"}, "need no scan"),
-        ({"port": "udp://a:1"}, "is not a port"),
+        ({"port": "http://a:1"}, "is not a port"),
         ({"protocol": "modbus-tcp"}, "tcp://host:port"),
         ({"stations": "1-x"}, "'x' is no number"),
         ({"stations": ""}, "'' is no number"),

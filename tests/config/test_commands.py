@@ -149,13 +149,11 @@ async def test_over_zenoh(served: tuple[str, Path]) -> None:
     [
         (("oven", "model"), 0, "9E (FX1N)"),
         (("oven", "loopback", "AB CD"), 0, "AB CD"),
-        (("oven", "model", "--direct"), 0, "9E (FX1N)"),
-        (("oven", "run", "--direct"), 1, "NAK 18"),
         (("saw", "stop"), 2, "control: true"),
         (("oven", "explode"), 2, "none of its commands"),
         (("nobody", "run"), 2, "no device nobody"),
         (("oven", "loopback", "Ä"), 2, "printable"),
-        (("oven", "loopback", "Ä", "--direct"), 2, "printable"),
+        (("oven", "model", "--direct"), 1, "leave out --direct"),
     ],
 )
 def test_by_hand(
@@ -166,7 +164,18 @@ def test_by_hand(
     assert says in (done.out if code == 0 else done.err)
 
 
-def test_by_hand_without_a_gateway(tmp_path: Path) -> None:
-    done = plc_gateway("control", written(tmp_path, free_endpoint()), "oven", "model")
-    assert done.code == 1
-    assert "no gateway" in done.err
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("oven", "model"), 1, "no gateway"),
+        (("oven", "model", "--direct"), 0, "9E (FX1N)"),
+        (("oven", "run", "--direct"), 1, "NAK 18"),
+        (("oven", "loopback", "Ä", "--direct"), 2, "printable"),
+    ],
+)
+def test_by_hand_without_a_gateway(
+    tmp_path: Path, arguments: tuple[str, ...], code: int, says: str
+) -> None:
+    done = plc_gateway("control", written(tmp_path, free_endpoint()), *arguments)
+    assert done.code == code, done
+    assert says in (done.out if code == 0 else done.err)

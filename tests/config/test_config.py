@@ -334,12 +334,12 @@ LINES = [
     bad(
         "line settings",
         on_line(
-            "port: udp://10.0.0.7:4001\nbaudrate: 1920\nformat: 7X1\necho: maybe\n"
+            "port: http://10.0.0.7:4001\nbaudrate: 1920\nformat: 7X1\necho: maybe\n"
             "parity: even\ndevices: {mixer: {protocol: vigor}}"
         ),
-        "3: lines.hall.port: 'udp://10.0.0.7:4001' is not a port: write a path such as "
-        "/dev/ttyUSB0, tcp://host:port, tls://host:port, rfc2217://host:port, listen://host:port, "
-        "modem:/dev/ttyS0, or simulator",
+        "3: lines.hall.port: 'http://10.0.0.7:4001' is not a port: write a path such as "
+        "/dev/ttyUSB0, tcp://host:port, tls://host:port, udp://host:port, rfc2217://host:port, "
+        "listen://host:port, modem:/dev/ttyS0, or simulator",
         "4: lines.hall.baudrate: 1920 is no baud rate of serial ports; the nearest is 2400",
         "5: lines.hall.format: '7X1' is no character format: write data bits (7 or 8), parity "
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
@@ -444,8 +444,24 @@ LINES = [
     bad(
         "modbus-tcp on a wire",
         on_line("port: /dev/ttyS3\ndevices:\n  a: {protocol: modbus-tcp, station: 1}"),
-        "5: lines.hall.devices.a.protocol: modbus-tcp needs a port tcp://host:port or "
-        "listen://host:port: it does not run on a serial line",
+        "5: lines.hall.devices.a.protocol: modbus-tcp needs a port tcp://host:port, "
+        "udp://host:port or listen://host:port: it does not run on a serial line",
+    ),
+    bad(
+        "datagrams that write",
+        on_line("port: udp://a:502\ndevices:\n  a: {protocol: modbus-tcp, station: 1, "
+                "control: true,\n    tags: {x: {address: 'holding:0', write: true}}}"),
+        "5: lines.hall.devices.a.control: a port udp:// only reads, because a datagram may arrive "
+        "twice or late: use tcp://, or remove `control`",
+        "6: lines.hall.devices.a.tags.x.write: a port udp:// only reads, because a datagram may "
+        "arrive twice or late, and an old write would be done after a newer one: remove `write`, "
+        "or use tcp://",
+    ),
+    bad(
+        "datagrams without a number",
+        on_line("port: udp://a:502\ndevices:\n  a: {protocol: modbus-rtu, station: 1}"),
+        "5: lines.hall.devices.a.protocol: modbus-rtu has no number in its frames, and datagrams "
+        "may change their order: only modbus-tcp has udp://",
     ),
     bad(
         "modbus-tcp beside a serial protocol",
@@ -1290,7 +1306,7 @@ def _zenoh(setting: str) -> str:
         *(_port(f"/dev/ttyS3\nbaudrate: {rate}") for rate in (0, -9600, 9601)),
         *(_port(port) for port in (
             "tcp://", "tcp://10.0.0.7", "'tcp://10.0.0.7:'", "rfc2217://a", "http://a:1", "4001",
-            "10.0.0.7:4001", "udp://a:1", '" COM3"', '""',
+            "10.0.0.7:4001", "http://a:1", '" COM3"', '""',
         )),
         *(_zenoh(setting) for setting in (
             "listen: [127.0.0.1:7447]", "connect: [tcp]", 'listen: [""]', "prefix: plant/**",

@@ -11,11 +11,12 @@ from gateway.errors import Evidence
 from tests.web.test_languages import wrong
 
 GATEWAY = Path(gateway.__file__).parent
+CHECK = GATEWAY / "cli" / "config" / "check.py"
 PAGE = GATEWAY.parent / "docs" / "codes.md"
 
 
 def codes() -> Iterator[str]:
-    """Yields the codes of all calls of `Fault` and `Diagnosis`."""
+    """Yields the codes of all calls of `Fault` and `Diagnosis`, and of the warnings of `check`."""
     yield from (one.value for one in Evidence)
     for file in GATEWAY.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
@@ -23,6 +24,8 @@ def codes() -> Iterator[str]:
                 case ast.Call(
                     func=ast.Name("Fault" | "Diagnosis"), args=[ast.Constant(str(code)), *_]
                 ) if code:
+                    yield code
+                case ast.Yield(ast.Tuple([ast.Constant(str(code)), _])) if file == CHECK:
                     yield code
 
 

@@ -1,4 +1,5 @@
-"""pymodbus' own server as a peer: `pymodbus_server.py FRAMER DEVICE` or `... FRAMER tcp PORT`.
+"""pymodbus' own server as a peer: `pymodbus_server.py FRAMER DEVICE`, `... FRAMER tcp PORT` or
+`... FRAMER udp PORT`.
 
 With `VENDOR MODEL` at the end it tells these by function 43/14. Unit 1: coils and discrete inputs,
 every third on; holding register n holds n, input register n 1000 + n; 10000 of each. Prints "ready"
@@ -10,7 +11,7 @@ import sys
 from typing import Any, cast
 
 from pymodbus import FramerType, ModbusDeviceIdentification
-from pymodbus.server import ModbusSerialServer, ModbusTcpServer
+from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusUdpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 COUNT = 10000
@@ -27,9 +28,13 @@ async def main(framer: str, *where: str) -> None:
     kind = FramerType[framer.upper()]
     names = dict(zip(("VendorName", "ModelName"), where[2:], strict=False))
     identity: Any = cast("Any", ModbusDeviceIdentification)(info_name=names) if names else None
-    server: ModbusTcpServer | ModbusSerialServer
-    if where[0] == "tcp":
-        server = ModbusTcpServer(
+    server: ModbusTcpServer | ModbusUdpServer | ModbusSerialServer
+    if where[0] in ("tcp", "udp"):
+        kinds: dict[str, type[ModbusTcpServer | ModbusUdpServer]] = {
+            "tcp": ModbusTcpServer,
+            "udp": ModbusUdpServer,
+        }
+        server = kinds[where[0]](
             [device()],
             framer=kind,
             address=("127.0.0.1", int(where[1])),

@@ -17,6 +17,7 @@ from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
 from tests.conftest import needs
+from tests.e2e.processes import started, write_config
 from tests.interop.modbus_wire import (
     PATIENCE,
     End,
@@ -27,7 +28,7 @@ from tests.interop.modbus_wire import (
     tcp_end,
 )
 from tests.interop.peers import HERE, finished, pty_pair, running
-from tests.zenoh_peer import free_port
+from tests.zenoh_peer import ZenohPeer, free_endpoint, free_port
 
 NPM = pytest.mark.usefixtures("modbus_serial")
 SOCAT = pytest.mark.usefixtures("socat")
@@ -200,3 +201,25 @@ async def test_mbpoll_writes_to_the_station_over_tcp() -> None:
         where = ("-m", "tcp", "-p", str(port), "-a", "9", "-t", "4", "-0", "-r", "40")
         await finished("mbpoll", *where, "127.0.0.1", "5", "6", "7")
     assert station.memory.read("holding", 40, 3) == [5, 6, 7]
+
+
+async def test_a_gateway_reads_pymodbus_by_datagrams(tmp_path: Path) -> None:
+    """The server is ended and comes back."""
+    port, endpoint = free_port(), free_endpoint()
+    tags = {"level": {"address": "holding:70"}}
+    device = {"protocol": "modbus-tcp", "station": 1, "tags": tags}
+    line = {"port": f"udp://127.0.0.1:{port}", "devices": {"oven": device}}
+    file = write_config(tmp_path / "plant.yaml", endpoint, {"hall": line})
+    server = (sys.executable, HERE / "pymodbus_server.py", "socket", "udp", str(port))
+    with started(file):
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            for _ in range(2):
+                async with running(*server, ready=b"ready"):
+                    good = await client.get_until(
+                        "plant/oven/level", lambda one: one["quality"] == "good"
+                    )
+                    assert good["value"] == 70
+                bad = await client.get_until(
+                    "plant/oven/level", lambda one: one["quality"] == "bad"
+                )
+                assert bad["reason"] in ("line-down", "no-reply")

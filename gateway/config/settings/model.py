@@ -133,8 +133,8 @@ class LineSection(Section):
     """One line and the devices on it."""
 
     port: Port
-    """A serial port, tcp://host:port, tls://host:port, rfc2217://host:port, listen://host:port,
-    modem:<port>, or simulator."""
+    """A serial port, tcp://host:port, tls://host:port, udp://host:port, rfc2217://host:port,
+    listen://host:port, modem:<port>, or simulator."""
     baudrate: Baudrate = None
     """Speed of the line, also behind a device server; left out: the default of the protocol."""
     format: Annotated[str | None, Parsed(parsers.serial_format, FORMAT_SCHEMA)] = None

@@ -89,12 +89,13 @@ _HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+)"
 _PORT_SCHEMA = {
     "type": "string",
     # A network port, or a path: no other scheme, and no `host:port` without a scheme.
-    "pattern": rf"^((tcp|tls|rfc2217|listen)://{_HOST}:[0-9]{{1,5}}"
+    "pattern": rf"^((tcp|tls|udp|rfc2217|listen)://{_HOST}:[0-9]{{1,5}}"
     r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
     "examples": [
         "/dev/ttyUSB0",
         "tcp://10.0.0.7:4001",
         "tls://10.0.0.7:802",
+        "udp://host:port",
         "rfc2217://host:port",
         "listen://0.0.0.0:5020",
         "modem:/dev/ttyS0",

@@ -30,6 +30,7 @@ from gateway.transport.port import (
     SerialPath,
     TcpAddress,
     TlsConfig,
+    UdpAddress,
     is_loopback,
     named,
 )
@@ -257,6 +258,8 @@ def _why_not(line: LineConfig, *, raw: bool) -> str:
         return "has `serve: true`: another master owns its wire"
     if line.listen_only:
         return "only listens: it never sends a request"
+    if isinstance(line.port, UdpAddress):
+        return "has a port udp://: its device takes datagrams of several programs itself"
     if isinstance(line.port, ModemAddress):
         return "has a modem: each request of a program would dial"
     if raw and line.close_after:
