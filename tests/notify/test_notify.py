@@ -1,5 +1,6 @@
 """A gateway whose alarms reach people, also over failures of the server and of itself."""
 
+import asyncio
 import json
 import signal
 from pathlib import Path
@@ -12,9 +13,12 @@ from gateway.errors import ConfigError
 from gateway.parts.notify.message import Message, message
 from gateway.parts.notify.outbox import Outbox
 from gateway.parts.notify.watch import TEST
+from gateway.stations.vigor import VigorStation
 from tests.e2e.processes import free_port, plc_gateway, started, until, write_config
+from tests.e2e.pty_modem import PATIENCE, PtyModem
 from tests.notify.test_ways import Mailbox, mail_server
-from tests.zenoh_peer import free_endpoint
+from tests.transport.modem import ModemModel
+from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
 def test_a_message_survives_a_dead_server_and_a_killed_gateway(tmp_path: Path) -> None:
@@ -53,6 +57,59 @@ def test_a_message_survives_a_dead_server_and_a_killed_gateway(tmp_path: Path) -
     missing = plc_gateway("notify", config)
     assert (missing.code, missing.err) == (1, "mail: connection refused\n")
     assert plc_gateway("notify", config, "pigeon").code == 2
+
+
+async def test_b3_8_an_alarm_dials_a_telephone_again_that_was_busy(tmp_path: Path) -> None:
+    far, endpoint, number = VigorStation(1), free_endpoint(), "0,26204393,,911"
+    far.memory.write("D", 100, [17])
+    model = ModemModel(
+        ("CONNECT 9600", "BUSY", "OK"), answers=lambda data: b"".join(far.hear(data, 0.0))
+    )
+    level = {"address": "D10", "write": True, "alarm": {"high": 30_000}}
+    slow = {"address": "D100", "every": "15min"}
+
+    def device(tag: dict[str, Any]) -> dict[str, Any]:
+        return {"protocol": "vigor", "station": 1, "tags": {"level": tag}}
+
+    async with PtyModem(model) as modem:
+        pumps = {
+            "port": f"modem:{modem.path}",
+            "modem": {"number": "26204400", "guard": "100ms", "idle": "200ms"},
+            "devices": {"pump": device(slow)},
+        }
+        config = write_config(
+            tmp_path / "plant.yaml",
+            endpoint,
+            {"hall": {"port": "simulator", "devices": {"mixer": device(level)}}, "pumps": pumps},
+            alarms={"path": "alarms.json"},
+            notify={
+                "telephone": {"line": "pumps", "number": number},
+                "rules": [{"to": ["telephone"], "alarms": ["mixer/level"], "ended": False}],
+            },
+        )
+        with started(config):
+            async with ZenohPeer("client", connect=[endpoint]) as client:
+                values = await client.subscribe("plant/pump/level")
+                read = await values.next(lambda sample: sample.json["value"] == 17)
+                await modem.until_online(False)
+                await client.get("plant/mixer/level/@set", b"30001")
+
+                async def status(path: str) -> Any:
+                    [document] = await client.get(f"plant/@gateway/demo/{path}")
+                    return document.json
+
+                async with asyncio.timeout(PATIENCE):
+                    while not (way := await status("notify/telephone"))["sent"]:
+                        await asyncio.sleep(0.1)
+                assert (way["waiting"], way["failed"], way["trouble"]) == (0, 0, "")
+                dialled = [one for one in model.commands if one.startswith("ATD")]
+                assert dialled == ["ATDT26204400", *[f"ATDT{number};"] * 2]
+                # The PLC of the line keeps its value, and no call of it is counted or tried.
+                [now] = await client.get("plant/pump/level")
+                assert now.json == read.json
+                calls = (await status("lines/pumps"))["calls"]
+                assert (calls["made"], calls["failed"], calls["last_result"]) == (1, 0, "complete")
+                assert number.encode() not in model.data
 
 
 def _saved(config: Path) -> str:
