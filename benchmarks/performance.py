@@ -10,6 +10,7 @@ into the page, with its drawing.
 import argparse
 import json
 import logging
+import math
 import os
 import sys
 import tempfile
@@ -156,7 +157,7 @@ class Row(NamedTuple):
 
 def _ratio(runs: list[dict[str, Any]]) -> float:
     each = [float(one["us_per_value"]) for one in runs]
-    return max(each) / min(each)
+    return max(each) / (min(each) or math.inf)  # a tiny run may take no tick of the clock
 
 
 def _kilobytes(runs: list[dict[str, Any]]) -> float:

@@ -21,7 +21,11 @@ async def test_a_flood_of_reads_denies_no_write(
     read: tuple[str, bytes | None], tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
-    lines = {"hall": vigor_line("simulator", {"recipe": {"address": "D500", "write": True}})}
+    lines = {
+        "hall": vigor_line(
+            "simulator", {"recipe": {"address": "D500", "write": True}}, reply_timeout="2s"
+        )
+    }
     config = write_config(tmp_path / "plant.yaml", endpoint, lines)
     with await asyncio.to_thread(started, config) as gateway:
         await asyncio.to_thread(gateway.says, "device online")

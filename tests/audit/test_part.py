@@ -76,7 +76,7 @@ async def test_writes_and_acknowledgements_are_there_after_a_kill(tmp_path: Path
     file = write_config(
         tmp_path / "plant.yaml",
         endpoint,
-        {"hall": vigor_line("simulator", tags)},
+        {"hall": vigor_line("simulator", tags, reply_timeout="2s")},
         gateway={"name": "demo", "audit": "audit.jsonl"},
         alarms={"path": "alarms.json"},
     )

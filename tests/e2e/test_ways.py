@@ -90,7 +90,9 @@ async def test_values_arrive_and_writes_are_done(
 ) -> None:
     endpoint = free_endpoint()
     port = open_port(stack, tmp_path)
-    config = write_config(tmp_path / "config.yaml", endpoint, {"hall": vigor_line(port, TAGS)})
+    config = write_config(
+        tmp_path / "config.yaml", endpoint, {"hall": vigor_line(port, TAGS, reply_timeout="2s")}
+    )
     stack.enter_context(started(config))
     async with ZenohPeer("client", connect=[endpoint]) as client:
         samples = await client.subscribe("plant/**")
