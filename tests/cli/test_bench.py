@@ -10,6 +10,7 @@ import aiohttp
 import pytest
 
 from gateway.cli.bench.draft import Draft
+from gateway.cli.bench.line import Scan
 from gateway.cli.bench.running import Running
 from gateway.cli.bench.trial import Trial
 from gateway.cli.client import connected
@@ -19,6 +20,7 @@ from gateway.config import Config, ConfigErrors, load
 from gateway.errors import ConfigError, GatewayError
 from gateway.plant.threads import off_loop
 from gateway.protocols.vigor import Vigor
+from gateway.stations.vigor import VigorStation
 from gateway.transport import SerialSettings
 from tests.cli.bench_page import BenchPage, benched, shown
 from tests.conftest import needs
@@ -243,6 +245,28 @@ async def test_what_a_person_wrote_meanwhile_is_never_overwritten(path: Path) ->
     assert path.read_text() == "# by hand too\n" + draft.text
 
 
+async def test_a_folder_that_takes_no_file_ends_no_trial(path: Path) -> None:
+    """Keep stopped the minute and kept nothing; the way back was tried once, and then forgotten."""
+    draft, running = changed(path), PlainRunning(path)
+    before, backup = (path.with_name(f"plant.yaml.{one}") for one in ("before", "bak"))
+    trial = Trial(draft, running, within=0.05)
+    await trial.apply()
+    (backup / "full").mkdir(parents=True)
+    with pytest.raises(ConfigError, match="cannot be written: Is a directory"):
+        await trial.keep()
+    aside = before.rename(path.with_name("aside"))
+    while "could not go back" not in trial.said:
+        await asyncio.sleep(0.01)
+    assert trial.left() is not None
+    with pytest.raises(ConfigError, match="keep the change before"):
+        await trial.apply()
+    aside.rename(before)
+    while trial.left() is not None:
+        await asyncio.sleep(0.01)
+    assert path.read_text() == HUMAN == running.taken[-1]
+    assert trial.said == "The change was not kept: the file is as before."
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -260,6 +284,34 @@ async def test_the_gateway_of_another_person_must_watch_its_file(
     assert "prefix changed" in running.why_not(load(path, text=text + "zenoh: {prefix: x}\n")) or (
         says
     )
+
+
+# -- the scan --
+
+
+async def test_a_port_that_is_taken_away_during_a_scan_loses_no_station_before(
+    path: Path,
+) -> None:
+    station, asked = VigorStation(0), 0
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal asked
+        while asked < 2 and (data := await reader.read(100)):
+            asked += 1
+            writer.write(b"".join(station.hear(data, 0.0)))
+        writer.close()
+
+    async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        scan = Scan()
+        options = {"port": f"tcp://127.0.0.1:{port}", "protocol": "vigor", "timeout": "1s"}
+        await scan.start(options, None)
+        async with asyncio.timeout(300):
+            while scan.runs:
+                await asyncio.sleep(0.01)
+    shown = scan.document()
+    assert [one["station"] for one in shown["found"]] == [0]
+    assert "closed by the other side" in shown["error"]
 
 
 # -- the way in --

@@ -43,7 +43,11 @@ def bench(
 
     Only this machine reaches it, with an address that works once. It writes nothing but FILE.
     """
-    if not file.resolve().parent.is_dir():
+    try:
+        is_there = file.resolve().parent.is_dir()
+    except OSError as error:
+        raise ConfigError(f"{file.parent}: {error.strerror}") from None
+    if not is_there:
         raise ConfigError(f"there is no folder {file.parent}")
     try:
         socket.create_server((_HOST, at)).close()

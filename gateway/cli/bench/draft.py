@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gateway import files
 from gateway.cli.config.check import size
 from gateway.cli.config.new import NamedStation, head_text, line_text
 from gateway.cli.sheets.import_command import with_sheet
-from gateway.cli.sheets.text_file import BOM, read_file
+from gateway.cli.sheets.text_file import BOM
 from gateway.config import Config, ConfigErrors, load
 from gateway.config.settings import parsers
 from gateway.config.sheets import Grid, adapted, devices_in, read_grid
@@ -45,7 +46,12 @@ class Draft:
 
     def read(self) -> None:
         """Reads FILE, and drops what was not applied. Raises `ConfigError`."""
-        self.file = read_file(self.path) if self.path.exists() else None
+        try:
+            self.file = files.read(self.path)
+        except FileNotFoundError:
+            self.file = None
+        except OSError as error:
+            raise ConfigError(f"{self.path} cannot be read: {error.strerror}") from None
         self.text = _text(self.file)
         self._before.clear()
         self._loaded = None

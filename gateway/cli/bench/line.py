@@ -40,7 +40,7 @@ def protocols() -> list[str]:
 
 
 class Scan:
-    """The scan of a port, and what it found."""
+    """The scan of a port, and what it found: also before it was stopped, or lost the port."""
 
     def __init__(self) -> None:
         self.port = self.error = self._what = ""
@@ -70,11 +70,12 @@ class Scan:
             if line.port == parse_port(port):
                 raise ConfigError(f"the gateway has this port open: it is line {line.name}")
         self.port, self.error, self.report = port, "", scanning.Report()
+        self._what, self._share = "", 0.0
         self._task = asyncio.create_task(self._run(plan), name="scan")
 
     async def _run(self, plan: scanning.Plan) -> None:
         try:
-            self.report = await scanning.scan(plan, share=self._progress)
+            await scanning.scan(plan, share=self._progress, report=self.report)
             if not self.report.found:
                 self.error = f"no station replied at {self.port}"
         except GatewayError as error:

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 
+from gateway import files
 from gateway.cli.bench.draft import Draft
 from gateway.cli.bench.running import Running
 from gateway.cli.sheets.text_file import backup_of, read_file, replace, write_new
@@ -40,7 +41,7 @@ class Trial:
         self._until: float | None = None  # loop time
         self._timer: asyncio.Task[None] | None = None
         self._turn = asyncio.Lock()
-        if self._before.exists():
+        if files.is_file(self._before):
             self._until = math.inf
 
     @property
@@ -88,34 +89,41 @@ class Trial:
                 self._say("The gateway runs the file.")
                 return
             self._say("The gateway took the change over.")
-            self._until = asyncio.get_running_loop().time() + self._within
-            self._timer = asyncio.create_task(self._later(), name="trial")
+            self._begin()
 
     async def keep(self) -> None:
-        """Ends the trial: the file stays."""
+        """Ends the trial: the file stays. Raises `ConfigError`; then it goes back in its time."""
         async with self._turn:
-            self._stop_timer()
             if self._until is not None:
                 await off_loop(_moved, self._before, backup_of(self._draft.path.resolve()))
-                self._until = None
+                self._end()
                 self._say("The change is kept.")
 
     async def back(self, said: str = "The file is as before.") -> None:
-        """Ends the trial: the file is as before, and the gateway takes it over."""
+        """Ends the trial: the file is as before, and the gateway takes it over. If the file cannot
+        be written, the trial goes on, and tries it again."""
         async with self._turn:
-            self._stop_timer()
             if self._until is None:
                 return
-            self._until = None
             try:
-                await off_loop(self._restore)
+                why_not = await off_loop(self._restore)
+            except ConfigError as error:
+                self._say(f"The file could not go back: {error}")
+                if math.isfinite(self._until):
+                    self._begin()
+                return
+            self._end()
+            if why_not:
+                self._say(f"The file could not go back: {why_not}")
+                return
+            try:
                 if self._release is not None:
                     await self._release()
                 if self._running.state:
                     await self._running.take(await off_loop(load, self._draft.path))
                 self._say(said)
             except GatewayError as error:
-                self._say(f"The file could not go back: {error}")
+                self._say(f"The file is as before, and the gateway does not run it: {error}")
 
     async def close(self) -> None:
         """Goes back if a person has not decided. A question of an earlier bench stays."""
@@ -127,7 +135,13 @@ class Trial:
         self._timer = None
         await self.back("The change was not kept: the file is as before.")
 
-    def _stop_timer(self) -> None:
+    def _begin(self) -> None:
+        self._end()
+        self._until = asyncio.get_running_loop().time() + self._within
+        self._timer = asyncio.create_task(self._later(), name="trial")
+
+    def _end(self) -> None:
+        self._until = None
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -135,10 +149,14 @@ class Trial:
     async def _undo(self, *, is_first: bool, ran: bool) -> None:
         """After a refusal: the file is as before, or not there, and a gateway goes on with it."""
         if is_first:
-            await off_loop(self._draft.path.unlink)
+            await off_loop(_removed, self._draft.path)
             self._draft.file = None
             return
-        await off_loop(self._restore)
+        try:
+            await off_loop(self._restore)
+        except ConfigError:
+            self._begin()
+            raise
         if ran:
             with suppress(GatewayError):
                 await self._running.take(await off_loop(load, self._draft.path))
@@ -169,18 +187,19 @@ class Trial:
                     backup=False,
                 )
             except ConfigError:
-                self._before.unlink(missing_ok=True)
+                _removed(self._before)
                 raise
         draft.file = read_file(draft.path)
 
-    def _restore(self) -> None:
-        """Raises `ConfigError`."""
+    def _restore(self) -> str:
+        """Returns why the file is to stay; empty: it is as before. Raises `ConfigError`."""
         path = self._draft.path.resolve()
         if read_file(path) != self._draft.file:
-            self._before.unlink(missing_ok=True)
-            raise ConfigError(f"{path.name} was changed meanwhile, and stays as it is")
+            _removed(self._before)
+            return f"{path.name} was changed meanwhile, and stays as it is"
         _moved(self._before, path)
         self._draft.file = read_file(path)
+        return ""
 
 
 def _moved(file: Path, to: Path) -> None:
@@ -188,3 +207,10 @@ def _moved(file: Path, to: Path) -> None:
         file.replace(to)
     except OSError as error:
         raise ConfigError(f"{to} cannot be written: {error.strerror}") from None
+
+
+def _removed(file: Path) -> None:
+    try:
+        file.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{file} cannot be removed: {error.strerror}") from None

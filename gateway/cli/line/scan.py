@@ -139,14 +139,16 @@ async def scan(
     plan: Plan,
     tell: Callable[[str], None] = lambda _: None,
     share: Callable[[str, float], None] = lambda _what, _share: None,
+    report: Report | None = None,
 ) -> Report:
     """Sends a harmless request to every station, at one speed and format after the other.
 
     Ends with the first speed and format at which a station replies: a line has only one. `share`
-    receives the station that is asked, and the share of all that is done. Raises `LineDown` when
-    the port cannot be opened, or is lost.
+    receives the station that is asked, and the share of all that is done. `report` has what replied
+    also if the scan is cancelled, or the port is lost. Raises `LineDown` when the port cannot be
+    opened, or is lost.
     """
-    report = Report()
+    report = report or Report()
     for number, settings in enumerate(plan.serial):
         tell(f"asking {len(plan.stations)} stations at {spoken(settings)}")
 
