@@ -42,6 +42,7 @@ class _Row:
     sure: bool = False  # it was acknowledged
     instead: bool = False  # it was the substitute
     early: bool = False  # it may have been
+    tried: bool = False  # another one after it, which was not done
     changed_at: float = 0.0  # when the source was published with another good value
     seen: Value | None = None
     ends: Counter[str] = field(default_factory=Counter)
@@ -106,7 +107,8 @@ class Carrier:
             end = error
         self._count(tag, self.buses[tag.device].carried)
         row.writing, row.sure = False, isinstance(end, WriteResult)
-        if isinstance(end, (*NOT_SENT, Refused, BadValue)):
+        row.tried = isinstance(end, (*NOT_SENT, Refused, BadValue))
+        if row.tried:
             row.written, row.at, row.sure, row.instead = before
         row.ends[type(end).__name__] += 1
         judge.story.counts[f"carried {type(end).__name__}"] += 1
@@ -133,7 +135,7 @@ class Carrier:
         """The gateway may count the age from an earlier read: after a new plan from the oldest one
         of all tags that are read together now."""
         age = self.judge.now - self.judge.read_at.get(row.source, -math.inf)
-        return age >= row.rule.stale - row.source.every
+        return age >= row.rule.stale - 2 * row.source.every  # the oldest may be late itself
 
     def _judge_value(self, row: _Row, value: Value, *, fresh: bool) -> None:
         judge, rule, name = self.judge, row.rule, f"transfer {row.rule.number}"
@@ -150,7 +152,7 @@ class Carrier:
         elif value != _expected(rule, sample.value):
             judge.broke(f"{name} carried {value!r} in place of {sample.value!r}")
         elif rule.every is None and row.at >= 0.0 and not (row.instead or row.early):
-            if row.sure and value == row.written:
+            if row.sure and value == row.written and not row.tried:
                 judge.broke(f"{name} carried {value!r} twice")
             elif judge.now - row.at < row.source.every - LOOP:
                 judge.broke(f"{name} carried two values in {judge.now - row.at:.3f} s")
