@@ -11,8 +11,8 @@ from functools import lru_cache
 from gateway.errors import Refused
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span
 
-MOST_UNITS, MOST_FORMS = 64, 5  # of one read; of the reads in one place
-PROOF_FORM = 7  # the first form that no resync has: they have five beside the outstanding one
+MOST_UNITS, MOST_FORMS = 64, 6  # of one read; of the reads in one place
+PROOF_FORM = 9  # the form that resyncs do not use otherwise
 MOST_EARLIER = 16  # resyncs before this one
 # The form of the reply to a read, such as its number of bytes; None: it cannot be read.
 FormOf = Callable[[Span], Hashable | None]

@@ -10,7 +10,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from itertools import groupby
 from pathlib import Path
@@ -104,7 +104,8 @@ def test_influxdb_has_every_value_once_and_no_good_one_that_is_not(
                 "SELECT value, good FROM plc WHERE device='mixer' AND \"name\"='speed'"
             )
             sent = gateway.documents["mixer/speed"]["time"]
-            assert datetime.fromisoformat(time) == datetime.fromisoformat(sent)
+            since = datetime.fromisoformat(sent) - datetime.fromtimestamp(0, UTC)
+            assert time == since // timedelta(microseconds=1)
             assert (value, is_good) == (12.5, True)
             [[_, text]] = influx.query("SELECT text FROM plc WHERE \"name\"='name'")
             assert text == 'A "B"\\'
