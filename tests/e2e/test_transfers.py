@@ -19,11 +19,13 @@ OWN = "plant/@gateway/demo"
 
 def lines() -> dict[str, Any]:
     tags = {"speed": {"address": "D10", "write": True, "scale": 0.1}}
-    hall = vigor_line("simulator", tags, turnaround="5ms")  # not measured: as `check` has it
+    # The turnaround is not measured: as `check` has it. A busy machine stops for longer than 0.2 s.
+    hall = vigor_line("simulator", tags, turnaround="5ms", reply_timeout="2s")
     hall["devices"]["oven"] = {
         "protocol": "vigor",
         "station": 2,
         "turnaround": "5ms",
+        "reply_timeout": "2s",
         "tags": {
             "setpoint": {"address": "D7", "write": {"min": 0, "max": 5000}},
             "lamp": {"address": "M3", "write": True},
