@@ -70,11 +70,11 @@ def digest(data: Mapping[str, Any], config: Config) -> str:
     """Returns a digest of all settings of a file, of its templates and its sheets, without comments
     and layout: files of one digest make gateways that do the same."""
     sheets = {sheet.device: sheet.raw for sheet in config.sheets}
-    packed = json.dumps(_with_sheets(data, sheets) if sheets else data, default=str)
+    packed = json.dumps(with_sheets(data, sheets) if sheets else data, default=str)
     return hashlib.sha256(packed.encode()).hexdigest()[:_DIGITS]
 
 
-def _with_sheets(data: Mapping[str, Any], sheets: Mapping[str, Mapping[str, object]]) -> Any:
+def with_sheets(data: Mapping[str, Any], sheets: Mapping[str, Mapping[str, object]]) -> Any:
     """Returns the data as if the tags of the sheets were in the file itself."""
     lines = {}
     for line, raw in data["lines"].items():

@@ -23,6 +23,7 @@ from gateway.transport.port import (
 )
 from gateway.transport.rs485 import LONGEST_DELAY, Rs485
 
+ONLY_READS = "a port udp:// only reads, because a datagram may arrive twice or late"
 LONGEST_CONNECT_DELAY = 10.0  # seconds
 SHOWS_ONE = "the side that listens shows a certificate: write certificate and key"
 LONGEST_KEEPALIVE = 3600.0  # seconds
@@ -176,12 +177,11 @@ def check_datagrams(
             text = f"{device.driver.protocol} has no number in its frames, and datagrams may change"
             mistakes.add((*place, "protocol"), f"{text} their order: only modbus-tcp has udp://")
         for name in [tag.name for tag in device.tags if tag.write is not None]:
-            text = "a port udp:// only reads, because a datagram may arrive twice or late, and an "
-            text += "old write would be done after a newer one: remove `write`, or use tcp://"
-            mistakes.add((*place, "tags", name, "write"), text)
+            text = "and an old write would be done after a newer one: remove `write`, or use tcp://"
+            mistakes.add((*place, "tags", name, "write"), f"{ONLY_READS}, {text}")
         if device.control:
-            text = "a port udp:// only reads, because a datagram may arrive twice or late: use "
-            mistakes.add((*place, "control"), f"{text}tcp://, or remove `control`")
+            text = f"{ONLY_READS}: use tcp://, or remove `control`"
+            mistakes.add((*place, "control"), text)
 
 
 def direction(line: LineSection, path: Path, mistakes: Mistakes) -> Rs485 | None:

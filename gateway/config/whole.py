@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gateway.config.loading import dumped, load
+from gateway.config.loading import dumped, load, with_sheets
 from gateway.config.yaml.file import TEXTS, read_yaml
 from gateway.config.yaml.syntax import DEEPEST
 from gateway.errors import ConfigError
@@ -26,24 +26,18 @@ def whole_text(path: Path) -> str:
     if templates:
         data["templates"] = templates | data.get("templates", {})
     for sheet in config.sheets:
-        device = _with_sheet(data, sheet.device)
-        if device is None:
+        if not _names_a_sheet(data, sheet.device):
             raise ConfigError(
                 f"{path}: {sheet.device} has {sheet.file.name} from a template or by `repeat`: its "
                 "tags go into no other file; write `tags_from` at a device of this name"
             )
-        del device["tags_from"]
-        device["tags"] = {**(device.pop("tags", None) or {}), **sheet.raw}
-    return dumped(data)
+    return dumped(with_sheets(data, {sheet.device: sheet.raw for sheet in config.sheets}))
 
 
-def _with_sheet(data: Mapping[str, Any], name: str) -> dict[str, Any] | None:
-    """Returns the device as the file has it."""
-    for line in data["lines"].values():
-        device = (line.get("devices") or {}).get(name)
-        if isinstance(device, dict) and "tags_from" in device:
-            return device
-    return None
+def _names_a_sheet(data: Mapping[str, Any], device: str) -> bool:
+    """Returns False for a device of a template, or of a `repeat`."""
+    found = (line["devices"].get(device) for line in data["lines"].values())
+    return any(isinstance(one, dict) and "tags_from" in one for one in found)
 
 
 def patched_text(path: Path, patch: Mapping[str, Any]) -> str:

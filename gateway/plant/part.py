@@ -213,7 +213,7 @@ class LoadedFile(Protocol):
 
     @property
     def current(self) -> Config:
-        """What the gateway has taken over."""
+        """The file as the gateway has taken it over."""
 
     async def reload(self) -> Sequence[str]:
         """Reads the file again. Returns when it was taken over, or why it was not: a sentence for

@@ -83,7 +83,7 @@ KEEPALIVE = 20.0  # seconds of silence until the system asks if the other side i
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """How a connection is made. `others`: more addresses of the same device server."""
+    """The way to make a connection. `others`: more addresses of the same device server."""
 
     others: tuple[tuple[str, int], ...] = ()
     bind: str = ""  # the address of this computer; empty: the system chooses
