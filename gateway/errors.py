@@ -30,6 +30,17 @@ from enum import StrEnum
 from typing import NamedTuple
 
 
+def words_of(error: Exception) -> str:
+    """Returns an error of the system in its words, without its number; the text of another error.
+
+    Of ports it is `gateway.transport.os_errors`, which knows what a number means there.
+    """
+    inner = getattr(error, "reason", None)  # of urllib
+    if isinstance(inner, OSError):
+        error = inner
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
 class GatewayError(Exception):
     """The base of all exceptions the gateway raises."""
 

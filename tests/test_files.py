@@ -2,11 +2,29 @@
 
 import os
 import socket
+import urllib.error
 from pathlib import Path
 
 import pytest
 
 from gateway import files
+from gateway.errors import words_of
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(28, "No space left on device", "a.new"), "No space left on device"),
+        (
+            urllib.error.URLError(ConnectionRefusedError(111, "Connection refused")),
+            "Connection refused",
+        ),
+        (ValueError("no number"), "no number"),
+        (TimeoutError(), "TimeoutError"),
+    ],
+)
+def test_an_error_is_said_without_the_number_of_the_system(error: Exception, words: str) -> None:
+    assert words_of(error) == words
 
 
 def test_a_regular_file_is_read(tmp_path: Path) -> None:

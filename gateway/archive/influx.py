@@ -16,7 +16,7 @@ from gateway.archive.rows import Row
 from gateway.archive.store import Cursor, Gap, StoreDown, cursor_of
 from gateway.bridges.influx.lines import escaped, line_of, quoted
 from gateway.bridges.influx.server import request
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, words_of
 
 _BATCH = 5000  # lines of a request
 _ANSWER_WITHIN = 60.0  # seconds
@@ -91,4 +91,4 @@ class InfluxStore:
         except urllib.error.HTTPError:
             raise
         except (OSError, http.client.HTTPException) as error:
-            raise StoreDown(str(error)) from None
+            raise StoreDown(words_of(error)) from None

@@ -21,7 +21,7 @@ from pyarrow import parquet as pq
 
 from gateway.archive.rows import Row
 from gateway.archive.store import Cursor, Overtaken, StoreDown, cursor_of
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, words_of
 from gateway.files import put
 
 _DAY = 86400 * 10**6  # microseconds
@@ -239,7 +239,7 @@ def _failures() -> Iterator[None]:
     try:
         yield
     except (OSError, pa.ArrowException) as error:
-        raise StoreDown(getattr(error, "strerror", None) or str(error).partition("\n")[0]) from None
+        raise StoreDown(words_of(error).partition("\n")[0]) from None
 
 
 def _table(rows: Sequence[Row]) -> Any:

@@ -33,7 +33,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "remote": ("plant.yaml new.yaml", "plant.yaml new.yaml --yes --within 5min"),
     "ca create": ("pki --at ca.plant:8444", "pki --days 1825"),
-    "ca issue": ("pki hall gateway.plant 10.0.0.5", "pki scada --client"),
+    "ca issue": ("pki hall gateway.plant 10.0.0.5", "pki scada --client --json"),
     "ca serve": ("pki", "pki --at ca.plant:8444 --listen 10.0.0.9:8444"),
     "ca invite": ("pki hall", "pki hall gateway.plant 10.0.0.5 --for 1d"),
     "ca list": ("pki", "pki --json"),

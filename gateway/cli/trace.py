@@ -20,7 +20,7 @@ from gateway.cli.terminal import AsJson, ConfigPath, err, printable
 from gateway.config import Config, LineConfig
 from gateway.config.messages import meant
 from gateway.config.settings import parsers
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import ConfigError, GatewayError, words_of
 from gateway.parts.recording.wire_file import event_lines
 
 LineName = Annotated[
@@ -200,5 +200,5 @@ class Recording:
             self._file = None
 
     def _failed(self, error: OSError) -> GatewayError:
-        why = error.strerror or str(error)
+        why = words_of(error)
         return GatewayError(f"recording ended: {self._path}: {why}; the gateway goes on")

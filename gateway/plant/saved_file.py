@@ -10,6 +10,7 @@ import orjson
 import structlog
 
 from gateway import files
+from gateway.errors import words_of
 
 log = structlog.get_logger("gateway")
 T = TypeVar("T")
@@ -71,9 +72,9 @@ class SavedFile:
         try:
             files.put(self._path, snapshot)  # names of operators are in it: closed to others
         except OSError as error:
-            if self.trouble != str(error):
-                self.trouble = str(error)
-                log.warning("state file not saved", file=str(self._path), why=str(error))
+            if self.trouble != (why := words_of(error)):
+                self.trouble = why
+                log.warning("state file not saved", file=str(self._path), why=why)
             return
         self._saved, self.trouble = snapshot, None
 
@@ -89,7 +90,7 @@ class SavedFile:
         except FileNotFoundError:
             return None
         except OSError as error:
-            log.warning("state file not read", file=str(self._path), why=str(error))
+            log.warning("state file not read", file=str(self._path), why=words_of(error))
             return None
         try:
             return parse(decode(data))
@@ -102,6 +103,8 @@ class SavedFile:
         try:
             self._path.replace(aside)
         except OSError as error:
-            log.warning("state file damaged", file=str(self._path), why=why, not_moved=str(error))
+            log.warning(
+                "state file damaged", file=str(self._path), why=why, not_moved=words_of(error)
+            )
         else:
             log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))

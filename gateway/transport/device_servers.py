@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 import structlog
 
-from gateway.errors import LineDown
+from gateway.errors import LineDown, words_of
 from gateway.transport.listen import begin, listening
 from gateway.transport.port import (
     LONGEST_REGISTRATION,
@@ -178,7 +178,7 @@ class _Door:
                 try:
                     connection, address = await loop.sock_accept(where)
                 except OSError as error:  # too many open files
-                    log.warning("connection refused", port=self.name, why=str(error))
+                    log.warning("connection refused", port=self.name, why=words_of(error))
                     await asyncio.sleep(_LOG_EVERY)
                     continue
                 one = _Connection(self, address[0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import serialx
 import structlog
 
-from gateway.errors import LineDown
+from gateway.errors import LineDown, words_of
 from gateway.transport.os_errors import line_down
 from gateway.transport.port import Receiver, SerialPath, SerialSettings
 from gateway.transport.rs485 import Rs485, send_by_hand, set_direction
@@ -154,7 +154,7 @@ class SwitchedPort(SerialPort):
                 await before
             late = await asyncio.to_thread(send_by_hand, port, data, seconds, self._wanted)
         except OSError as error:
-            self.break_off(f"cannot send: {error.strerror or error}")
+            self.break_off(f"cannot send: {words_of(error)}")
             return
         if late - self._wanted.after > self._latest:
             self._latest = 2 * (late - self._wanted.after)

@@ -109,6 +109,7 @@ def test_a_host_sees_births_deaths_and_nothing_good_that_is_not(mosquitto: Broke
                 gateway.answer = "refused"
                 host.send(command("motor/recipe", int=9), "mixer")
                 first.says("mixer/motor/recipe = 9: refused")
+                gateway.until_written(3)
                 assert [value for _, value in gateway.written] == [7, -5, 9]
 
                 first.end(signal.SIGKILL)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gateway.config import load
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, documents
 from tests.e2e.processes import gateway, vigor_line
 from tests.zenoh_peer import free_port
 
@@ -27,9 +27,12 @@ def test_a_person_makes_certificates_and_sees_them(command: Command, tmp_path: P
     assert [line.split()[:2] for line in command("ca", "list", pki).out.splitlines()] == [
         *(["name", "state"], ["hall", "valid"], ["scada", "revoked"])
     ]
-    [hall, scada] = map(json.loads, command("ca", "list", pki, "--json").out.splitlines())
+    [hall, scada] = documents(command("ca", "list", pki, "--json").out)
     assert hall["addresses"] == ["gateway.plant", "10.0.0.5"]
     assert scada["client"] is True
+    [issued] = documents(command("ca", "issue", pki, "scada", "--client", "--json").out)
+    assert issued["key"] == str(pki / "scada.key")
+    assert {*issued} == {"certificate", "key", "until"}
 
 
 @pytest.mark.parametrize(
@@ -74,9 +77,17 @@ def test_a_gateway_enrols_with_the_code_that_a_person_carries(
         program.says("authority ready", at)
         code = command("ca", "invite", pki, "hall", "gateway.plant").out.strip()
         done = command("enrol", code, "--folder", tmp_path / "own")
-        assert command("enrol", "--renew", "--folder", tmp_path / "own").out.endswith(
-            "need not be renewed\n"
+        renew = "enrol", "--renew", "--folder", tmp_path / "own"
+        assert command(*renew).out.endswith("need not be renewed\n")
+        [renewed] = documents(command(*renew, "--json").out)
+        assert {*renewed} == {"certificate", "key", "ca", "until", "new"}
+        assert renewed["new"] is False
+        [invited] = documents(command("ca", "invite", pki, "press", "--json").out)
+        assert (invited["name"], invited["at"], invited["good"]) == ("press", at, 3600)
+        [own] = documents(
+            command("enrol", invited["code"], "--folder", tmp_path / "press", "--json").out
         )
+        assert (own["certificate"], own["new"]) == (str(tmp_path / "press/press.pem"), True)
         assert program.end() == 0
     first, _, section = done.out.partition("\n")
     assert first.startswith(f"{tmp_path / 'own/hall.pem'}: valid until 20")

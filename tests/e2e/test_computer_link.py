@@ -3,6 +3,7 @@
 PLC, cable, gateway and Zenoh client are processes of their own.
 """
 
+import json
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -149,8 +150,11 @@ async def test_control(oven: Oven) -> None:
     done = plc_gateway("control", oven.config, "oven", "global", "off")
     assert done.code == 0
     until(lambda: oven.plc.tell("get M8126") == "0", "the flag changes")
+    done = plc_gateway("control", oven.config, "oven", "loopback", "HI", "--json")
+    assert (done.code, {*json.loads(done.out)}) == (0, {"answer", "time", "took"})
     oven.plc.tell("mute")
-    assert plc_gateway("control", oven.config, "oven", "model").code == 1
+    done = plc_gateway("control", oven.config, "oven", "model", "--json")
+    assert (done.code, json.loads(done.out)["error"]) == (1, "no-reply")
 
 
 def _read(document: dict[str, object]) -> bool:

@@ -26,7 +26,7 @@ from gateway.bridges.influx.lines import line_of
 from gateway.bridges.influx.server import request
 from gateway.bridges.program import Gateways, opened, say
 from gateway.bridges.remote_plant import RemotePlant
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, words_of
 
 BATCH = 5000  # lines of one request
 ANSWER_WITHIN = 10.0  # seconds
@@ -113,7 +113,9 @@ class Bridge:
             self._lines.extendleft(reversed(batch))
             while len(self._lines) > self._most:
                 self._lose(self._lines.popleft())
-            say(f"not sent: {error}; {len(self._lines)} lines wait, {self._lost} are lost")
+            say(
+                f"not sent: {words_of(error)}; {len(self._lines)} lines wait, {self._lost} are lost"
+            )
             return False
         for line in batch:
             self._gaps.sent(line.device, line.time)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gateway import files
 from gateway.bridges.program import say
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, words_of
 
 
 class Gaps:
@@ -73,7 +73,7 @@ def _read(path: Path) -> dict[str, str]:
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError):
             raise
-        raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(f"{path}: {words_of(error)}") from None
     if not isinstance(known, dict) or not all(isinstance(one, str) for one in known.values()):
         raise ConfigError(f"{path} is not a state file of `bridge influx`: remove it")
     return known

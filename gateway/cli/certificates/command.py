@@ -62,10 +62,11 @@ def issue(
     addresses: Addresses = _NONE,
     client: Client = False,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long it is valid.")] = 825,
+    as_json: AsJson = False,
 ) -> None:
     """Make a key and a certificate here, to be copied by a person."""
     file = _authority(folder).issue(_holder(name, addresses, client=client), days)
-    out.print(f"{file}: valid until {_day(expires(files.read(file)))}")
+    _print_made(file, {"key": str(file.with_suffix(".key"))}, as_json=as_json)
 
 
 @cli.command()
@@ -92,10 +93,15 @@ def invite(
     client: Client = False,
     days: Annotated[int, typer.Option(min=1, max=3650, help="Of each certificate.")] = 120,
     within: Annotated[str, typer.Option("--for", help="How long the code is good.")] = "1h",
+    as_json: AsJson = False,
 ) -> None:
     """Print a code with which a gateway gets its certificate, once."""
     holder = _holder(name, addresses, client=client)
-    code = _authority(folder).invite(holder, days, interval(within))
+    seconds = interval(within)
+    code = _authority(folder).invite(holder, days, seconds)
+    if as_json:
+        print(json.dumps({"name": code.name, "at": code.at, "code": str(code), "good": seconds}))
+        return
     err.print(f"good once, for {within}; on the gateway: plc-gateway enrol CODE")
     print(code)
 
@@ -138,6 +144,7 @@ def enrol(
     renew: Annotated[
         bool, typer.Option("--renew", help="In the last third of its life: a new certificate.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Get the certificate of this gateway with a code, or renew it."""
     if (code is None) != renew:
@@ -146,18 +153,26 @@ def enrol(
         from gateway.cli.certificates import enrolment
     if code is None:
         found, is_new = enrolment.renew(folder)
-        if not is_new:
-            out.print(f"{found.certificate} need not be renewed")
-            return
     else:
-        found = enrolment.enrol(folder, Code.parsed(code))
-    until = expires(files.read(found.certificate))
-    out.print(f"{found.certificate}: valid until {_day(until)}")
-    if code is not None:
+        found, is_new = enrolment.enrol(folder, Code.parsed(code)), True
+    if not is_new and not as_json:
+        out.print(f"{found.certificate} need not be renewed")
+        return
+    others = {"key": str(found.key), "ca": str(found.ca), "new": is_new}
+    _print_made(found.certificate, others, as_json=as_json)
+    if code is not None and not as_json:
         tls = "".join(f"{name}: {file.resolve()}, " for name, file in found._asdict().items())
         err.print("For the file of the gateway, with the address of its router:")
         print("zenoh:\n  mode: client\n  listen: []\n  connect: [tls/router.plant:7447]")
         print(f"  tls: {{{tls}mutual: true}}")
+
+
+def _print_made(certificate: Path, others: dict[str, object], *, as_json: bool) -> None:
+    until = _day(expires(files.read(certificate)))
+    if as_json:
+        print(json.dumps({"certificate": str(certificate), **others, "until": until}))
+    else:
+        out.print(f"{certificate}: valid until {until}")
 
 
 def _authority(folder: Path) -> "Authority":

@@ -21,7 +21,7 @@ from gateway.cli.certificates.code import Code
 from gateway.cli.certificates.state import keep, read
 from gateway.config.settings.parsers import web_address
 from gateway.contract.access.secrets import closed_to_others
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import ConfigError, GatewayError, words_of
 
 WITHIN = 15.0  # seconds for each step of a connection
 MOST_BYTES = 2**20
@@ -150,7 +150,7 @@ def _context(ca: Path) -> ssl.SSLContext:
     try:
         return ssl.create_default_context(cafile=ca)
     except (ssl.SSLError, OSError) as error:
-        raise ConfigError(f"{ca} cannot be used: {error}") from None
+        raise ConfigError(f"{ca} cannot be used: {words_of(error)}") from None
 
 
 def _asked(
@@ -169,7 +169,7 @@ def _asked(
         why = f"{at} cannot be trusted: {error.verify_message}; is a clock wrong?"
         raise GatewayError(why) from None
     except (OSError, HTTPException) as error:
-        raise GatewayError(f"the authority {at} does not answer: {error}") from None
+        raise GatewayError(f"the authority {at} does not answer: {words_of(error)}") from None
     finally:
         connection.close()
     if reply.status == HTTPStatus.OK:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from gateway.config import LineConfig
-from gateway.errors import LineDown
+from gateway.errors import LineDown, words_of
 from gateway.transport.port import SerialPath
 from gateway.transport.rs485 import Rs485, send_by_hand
 from gateway.transport.serial_port import SerialPort, open_serial
@@ -77,7 +77,7 @@ async def _by_hand(port: SerialPort, wanted: Rs485, character: float) -> str:
             send = asyncio.to_thread(send_by_hand, own, b"", CHARACTERS * character, wanted)
             late.append(await send)
     except OSError as error:
-        raise LineDown(f"{port.name}: RTS is not switched: {error.strerror or error}") from error
+        raise LineDown(f"{port.name}: RTS is not switched: {words_of(error)}") from error
     middle, worst = sorted(late)[TRIES // 2], max(late)
     return (
         f"RTS is switched back {middle * 1e3:.1f} ms after the last bit, {worst * 1e3:.1f} ms at "

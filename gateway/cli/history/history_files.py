@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, TextIO
 
 from gateway.config.sheets import neutral
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, words_of
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -85,7 +85,7 @@ def new_file(path: Path) -> Iterator[Path]:
         yield unfinished
         unfinished.rename(path)
     except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror or error}") from None
+        raise ConfigError(f"{path} cannot be written: {words_of(error)}") from None
     finally:
         unfinished.unlink(missing_ok=True)
 

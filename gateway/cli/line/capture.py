@@ -12,7 +12,7 @@ from typing import Self
 
 from gateway import files
 from gateway.config import LineConfig
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, words_of
 from gateway.protocols.listening import Asked, Listenable, TrafficReader
 
 _RAW_IP, _UPPER_PDU = 101, 252  # link types
@@ -104,7 +104,7 @@ class Capture:
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> GatewayError:
-        why = error.strerror or str(error)
+        why = words_of(error)
         return GatewayError(f"capture ended: {self._path}: {why}; the gateway goes on")
 
 

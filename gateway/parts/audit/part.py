@@ -13,7 +13,7 @@ import structlog
 from gateway.contract.documents.requests import AuditNote
 from gateway.contract.interfaces import Keyed
 from gateway.contract.past import timerange
-from gateway.errors import Busy, Unknown
+from gateway.errors import Busy, Unknown, words_of
 from gateway.parts.audit.file import AuditFile, Event, read, within
 from gateway.plant.part import Core, Kind, Part, Phase
 from gateway.plant.threads import off_loop
@@ -109,7 +109,7 @@ class AuditPart:
         try:
             await off_loop(self._file.append, batch)
         except OSError as error:
-            self._failed(error.strerror or str(error))
+            self._failed(words_of(error))
             return False
         self._trouble = ""
         for _ in batch:

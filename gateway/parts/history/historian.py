@@ -15,7 +15,7 @@ from gateway.contract.documents.values import Time
 from gateway.contract.past.buckets import Bucket, Now
 from gateway.contract.past.history_query import HistoryQuery
 from gateway.contract.past.timerange import TimeRange, time_range
-from gateway.errors import BadValue, Busy
+from gateway.errors import BadValue, Busy, words_of
 from gateway.parts.history.answers.bucket_search import BucketSearch
 from gateway.parts.history.answers.outcomes import Outcome, Outcomes, Ring
 from gateway.parts.history.answers.recent import Recent
@@ -216,4 +216,4 @@ def _readable(found: Iterator[T]) -> Iterator[T]:
     try:
         yield from found
     except (sqlite3.Error, OSError) as error:
-        raise Busy(f"history cannot be read: {error}") from error
+        raise Busy(f"history cannot be read: {words_of(error)}") from error

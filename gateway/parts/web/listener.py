@@ -13,7 +13,7 @@ import structlog
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, words_of
 from gateway.parts.web import exposure
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.guard import Guard
@@ -131,7 +131,7 @@ class Listener:
                     connection, self._config.host, self._config.port, backlog=_BACKLOG
                 )
             except OSError as error:
-                if (why := error.strerror or str(error)) != logged:
+                if (why := words_of(error)) != logged:
                     log.error("web page not served", at=self._config.url, why=why)  # noqa: TRY400
                 logged = why
                 await asyncio.sleep(AGAIN)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, words_of
 from gateway.parts.history.answers.bucket_search import BucketSearch
 from gateway.parts.history.answers.outcomes import Ring
 from gateway.parts.history.answers.recent import Extent, Recent
@@ -37,7 +37,7 @@ def offline(path: Path) -> Iterator[tuple[Search, BucketSearch]]:
         search = Search(recent, reader, damage)
         yield search, BucketSearch(recent, reader, damage, _MOST_BUCKETS)
     except (sqlite3.Error, OSError) as error:
-        raise GatewayError(f"{path} cannot be read: {error}") from None
+        raise GatewayError(f"{path} cannot be read: {words_of(error)}") from None
     finally:
         reader.renew()
 
@@ -79,7 +79,7 @@ def backup(history: Path, copy: Path) -> int:
     except (OSError, sqlite3.Error) as error:
         with suppress(OSError):
             unfinished.unlink()
-        raise GatewayError(f"{history} was not copied to {copy}: {error}") from None
+        raise GatewayError(f"{history} was not copied to {copy}: {words_of(error)}") from None
     return copy.stat().st_size
 
 
@@ -127,7 +127,7 @@ def salvage(
             aside.move(path, path.with_name(f"{path.name}.replaced-{stamp}"))
         made.rename(path)
     except (OSError, sqlite3.Error) as error:
-        raise GatewayError(f"{path} was not salvaged: {error}") from None
+        raise GatewayError(f"{path} was not salvaged: {words_of(error)}") from None
     finally:
         _remove(made)
         os.close(lock)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from gateway.errors import Damaged
+from gateway.errors import Damaged, words_of
 from gateway.parts.history.files.aside import asides
 from gateway.parts.history.store.file import HistoryFile, is_damage, move_aside
 from gateway.parts.history.store.reader import Reader
@@ -105,7 +105,7 @@ class Writer:
             else:
                 self._failed(_sentence(error))
         except OSError as error:
-            self._failed(error.strerror or str(error))
+            self._failed(words_of(error))
 
     def _store(self, file: HistoryFile) -> None:
         now = time.monotonic()

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gateway.contract.fleet_files import Wanted, state_of
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, words_of
 from gateway.plant.threads import off_loop
 
 PATIENCE = 5.0  # seconds that an answer waits for the files
@@ -70,7 +70,7 @@ class FleetFiles:
             last = error.stderr.decode("utf-8", "replace").splitlines()[-1:]
             raise GatewayError(f"its files were not read: {' '.join(last)}") from None
         except (subprocess.SubprocessError, OSError, ValueError) as error:
-            raise GatewayError(f"its files were not read: {error}") from None
+            raise GatewayError(f"its files were not read: {words_of(error)}") from None
         found = {
             gateway: Wanted(Path(file), digest)
             for gateway, (file, digest) in wanted.items()
