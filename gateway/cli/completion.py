@@ -38,11 +38,14 @@ def _keys(config: "Config") -> list[str]:
 
 
 def _alarms(config: "Config") -> list[str]:
+    from gateway.parts.alarms.own_faults import FAULTS, GATEWAY
     from gateway.tags import AlarmRule
 
     devices = config.devices
     of_tags = [tag.key for one in devices for tag in one.tags if tag.feature(AlarmRule)]
-    return [*of_tags, *(one.name for one in devices), *(f"line:{one.name}" for one in config.lines)]
+    own = [f"{GATEWAY}{code}" for code in FAULTS]
+    of_lines = [f"line:{one.name}" for one in config.lines]
+    return [*of_tags, *(one.name for one in devices), *of_lines, *own]
 
 
 tags = _of(lambda config: [device.name for device in config.devices] + _keys(config))

@@ -27,6 +27,7 @@ class Level(StrEnum):
     DOWN = "down"  # of a line
     SILENT = "silent"  # of a line: none of its devices replies
     STOPPED = "stopped"  # of a transfer
+    FAULT = "fault"  # of the gateway itself
 
 
 BELOW = frozenset({Level.LOW, Level.LOW_LOW, Level.OFF})  # reached from above

@@ -19,6 +19,9 @@ class Silent:
     def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
         make()
 
+    async def documents(self, _max_age: float) -> Any:
+        return {"status": {"refused_devices": {}}}
+
     async def write_own(self, *_: object) -> Any:
         raise AssertionError("no part of this test writes")
 

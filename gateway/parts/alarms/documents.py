@@ -11,7 +11,7 @@ from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
 _OF_BITS = {Level.ON: True, Level.OFF: False}
-_WATCHED = (Level.OFFLINE, Level.DOWN, Level.SILENT, Level.STOPPED)
+_WATCHED = (Level.OFFLINE, Level.DOWN, Level.SILENT, Level.STOPPED, Level.FAULT)
 # The nearest word of the contract; `change` has the event itself.
 _TOLD = {
     Event.FOLDED: Event.ENDED,

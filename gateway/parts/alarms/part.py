@@ -25,6 +25,7 @@ from gateway.parts.alarms.entry import AUDITED, Entry
 from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.alarms.machine import Acknowledgement, Event, State, Suppression
 from gateway.parts.alarms.orders import Do, Order, parse_order
+from gateway.parts.alarms.own_faults import OwnFaults
 from gateway.parts.alarms.settings import AlarmsSection
 from gateway.parts.alarms.watched import conditions, tuned
 from gateway.plant.part import Core, Kind
@@ -33,6 +34,7 @@ from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 
 LOOK_EVERY = 1.0  # seconds between two looks at the conditions
+FAULTS_EVERY = 5.0  # seconds between two looks at the faults of the gateway
 MOST_SHOWN = 50  # on the status page
 STATES = ("open", "suppressed", "all", *State)  # of a list
 _BATCH_SIZE = 500  # alarms in one turn of the loop
@@ -48,23 +50,32 @@ class AlarmPart:
         self._settings = core.config.part(AlarmsSection) or AlarmsSection()
         self._file = AlarmFile(self._settings.path, self.alarms)
         self._known: tuple[object, ...] = ()  # what the conditions are of
+        self._own_faults = OwnFaults()
         self.alarms.subscribe(self._changed)
 
     # -- life --
 
     async def begin(self) -> None:
+        self._plant.doors.conditions.put("gateway", self._own_faults.conditions())
         self._watch()
         await self._file.restore()
 
     async def run(self) -> None:
         async with self._file.kept(), asyncio.TaskGroup() as tasks:
             tasks.create_task(self._look())
+            tasks.create_task(self._look_at_faults())
 
     async def _look(self) -> None:
         while True:
             self._watch()
             self.alarms.look()
             await asyncio.sleep(LOOK_EVERY)
+
+    async def _look_at_faults(self) -> None:
+        """Waits first: after a start the parts and certificates are not known yet."""
+        while True:
+            await asyncio.sleep(FAULTS_EVERY)
+            self._own_faults.take(await self._core.north.documents(FAULTS_EVERY))
 
     def _watch(self) -> None:
         """Follows the conditions of the plant and of other parts."""

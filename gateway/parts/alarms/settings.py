@@ -13,13 +13,14 @@ from gateway.tags import AlarmRule
 
 
 class WatchedSection(Section):
-    """Alarms without a limit: of devices, lines or transfers."""
+    """Alarms without a limit: of devices, lines, transfers or the gateway."""
 
     priority: Literal["critical", "high", "medium", "low"] | None = None
     """The priority: how soon an operator must act; left out: critical of lines, high of devices,
-    medium of transfers."""
+    medium of transfers; of the gateway it depends on the fault."""
     delay: Duration | None = None
-    """It is an alarm after so long; left out: 0 s of devices, 3 s of others."""
+    """It is an alarm after so long; left out: 0 s of devices, 10 s of the gateway, 3 s of
+    others."""
     off_delay: Duration = 5.0
     """It is an alarm until it works for so long."""
 
@@ -46,6 +47,8 @@ class AlarmsSection(Section):
     """A line that is down is an alarm."""
     transfers: Watched = True
     """A transfer that does not work is an alarm."""
+    gateway: Watched = True
+    """A fault of the gateway itself is an alarm, such as a full disk or a lost router."""
     shelve_at_most: Duration = 86400.0
     """The longest time that an operator may shelve an alarm."""
 

@@ -20,10 +20,12 @@ LINE_DELAY = 3.0
 # fall silent one after the other, and then the line is the alarm.
 LINE_KNOWN = 15.0
 LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
+# The setting of each kind.
 _KINDS = {
-    Level.DOWN: ("lines", Priority.CRITICAL),
-    Level.OFFLINE: ("devices", Priority.HIGH),
-    Level.STOPPED: ("transfers", Priority.MEDIUM),
+    Level.DOWN: "lines",
+    Level.OFFLINE: "devices",
+    Level.STOPPED: "transfers",
+    Level.FAULT: "gateway",
 }
 _USUAL = WatchedSection()
 _SILENT, _DOWN = 1.0, 2.0  # readings of a line
@@ -42,12 +44,17 @@ def conditions(
         rule = AlarmRule(
             {Level.DOWN: _DOWN, Level.SILENT: _SILENT},
             delay=LINE_DELAY,
+            priority=Priority.CRITICAL,
             text=f"line {name} is down",
             texts={Level.SILENT: f"line {name} is silent"},
         )
         found[key] = Condition(rule, partial(_line, line, partial(level_of, key), now))
         for device in line.engine.devices:
-            rule = AlarmRule({Level.OFFLINE: True}, text=f"{device.name} does not reply")
+            rule = AlarmRule(
+                {Level.OFFLINE: True},
+                priority=Priority.HIGH,
+                text=f"{device.name} does not reply",
+            )
             parent = key if device.health.is_probed else ""
             found[device.name] = Condition(rule, partial(_device, line, device, now), parent)
     return found
@@ -57,14 +64,14 @@ def tuned(found: Mapping[str, Condition], config: AlarmsSection) -> dict[str, Co
     """Returns the conditions that the file wants, with its delays and priorities."""
     wanted = {}
     for key, one in found.items():
-        setting, priority = _KINDS[next(iter(one.rule.limits))]
+        setting = _KINDS[next(iter(one.rule.limits))]
         own: bool | WatchedSection = getattr(config, setting)
         if own is False:
             continue
         own = _USUAL if own is True else own
         rule = replace(
             one.rule,
-            priority=Priority(own.priority or priority),
+            priority=Priority(own.priority or one.rule.priority),
             delay=one.rule.delay if own.delay is None else own.delay,
             off_delay=own.off_delay,
         )

@@ -77,7 +77,7 @@ def _line(notice: Notice, say: Say) -> str:
         words.append(_text(alarm, say))
     if alarm.get("limit") is not None:
         words.append(say(f"limit {alarm['level']} {_number(alarm['limit'])}"))
-    if alarm["value"] is not None and alarm.get("level") not in ("offline", "down", "silent"):
+    if alarm["value"] is not None and "/" in alarm["alarm"]:
         words.append(say(f"value {_number(alarm['value'])} {alarm['unit']}".rstrip()))
     if alarm.get("detail"):
         words.append(say(str(alarm["detail"])))

@@ -5,7 +5,7 @@ A message is sent at least once: after a crash, or an answer that came too late,
 """
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -22,14 +22,26 @@ from gateway.parts.notify.ways import ways, why_not_sent
 from gateway.plant.part import Core, Kind, Listed, Part
 from gateway.plant.saved_file import SavedFile
 from gateway.plant.threads import off_loop
+from gateway.tags.timestamps import rfc3339
 
 log = structlog.get_logger("gateway")
 FORMAT = 1
 LOOK_EVERY = 1.0  # seconds
 READ_EVERY = 10.0  # seconds: values change without an event
 MOST_ALARMS = 2000  # of the list: those without acknowledgement first, then by priority
+STOPPED_AFTER = 10.0  # seconds: a part that fails once works again earlier
 AGAIN_FIRST, AGAIN_LONGEST = 2.0, 60.0  # seconds between two tries
 CLOSE_WITHIN = 0.5  # seconds
+# The alarm while no part has alarms. That part goes on with it, and says its end.
+_STOPPED = {
+    "alarm": "gateway:part-stopped",
+    "state": "active",
+    "level": "fault",
+    "value": True,
+    "priority": "critical",
+    "text": "a part of the gateway stopped",
+    "detail": "alarms stopped: no alarm is raised until that part works again",
+}
 # By rule and alarm: when it was raised, when it was sent (ns since 1970), whether its end was.
 _ToldByRule = dict[str, dict[str, tuple[str, int, bool]]]
 
@@ -49,6 +61,8 @@ class NotifyPart:
         self._alarms: Mapping[str, Alarm] = {}  # those that are not normal
         self._read: tuple[object, ...] = ()  # list and change of the last read
         self._read_at = -READ_EVERY
+        self._stopped: Alarm = {}
+        self._stopped_at: float | None = None  # by the clock of the loop
 
     # -- life --
 
@@ -85,9 +99,12 @@ class NotifyPart:
 
     async def _look(self) -> None:
         while True:
-            for listed in self._core.others.each(Listed):
-                await self._read_alarms(listed)
-                self._apply(listed)
+            if found := self._core.others.each(Listed):
+                await self._read_alarms(found[0])
+                self._stopped_at = None
+                self._apply(self._alarms, found[0].one)
+            else:
+                self._apply(self._without_list(), _as_before)
             if self._unsaved and self._file.save_soon(self._snapshot()):
                 self._unsaved = False
             await asyncio.sleep(LOOK_EVERY)
@@ -100,12 +117,20 @@ class NotifyPart:
         self._alarms = {str(one["alarm"]): one for one in page["alarms"]}
         self._read, self._read_at = version, now
 
-    def _apply(self, listed: Listed) -> None:
+    def _without_list(self) -> Mapping[str, Alarm]:
+        """Returns the alarm that there are no alarms now, unless it is too early to tell."""
+        now, wall = asyncio.get_running_loop().time(), self._core.plant.wall()
+        if self._stopped_at is None:
+            self._stopped_at, self._stopped = now, {**_STOPPED, "raised": rfc3339(wall)}
+        is_told = now - self._stopped_at >= STOPPED_AFTER
+        return {self._stopped["alarm"]: self._stopped} if is_told else {}
+
+    def _apply(self, alarms: Mapping[str, Alarm], gone: Callable[[str], Alarm | None]) -> None:
         now, wall = asyncio.get_running_loop().time(), self._core.plant.wall()
         clock = datetime.fromtimestamp(wall / 1e9, UTC).astimezone()
         config = self._core.config
         for watch in self._watches:
-            if notices := watch.look(self._alarms, listed.one, now, clock):
+            if notices := watch.look(alarms, gone, now, clock):
                 new = message(config.zenoh.prefix, config.name, notices, wall, self._language)
                 for way in watch.rule.to:
                     self._boxes[way].put(new, now)
@@ -151,6 +176,11 @@ class NotifyPart:
         }
         waiting = {way: box.saved(now) for way, box in self._boxes.items()}
         return orjson.dumps({"form": FORMAT, "told": told, "waiting": waiting})
+
+
+def _as_before(_key: str) -> Alarm:
+    """Returns that the alarm has not ended: it is not known."""
+    return {"state": "active"}
 
 
 def _parse(document: Any) -> tuple[_ToldByRule, dict[str, list[tuple[Message, float]]]]:

@@ -146,7 +146,7 @@ class RuleSection(Section):
     priority: Literal["critical", "high", "medium", "low"] = "low"
     """Alarms of this priority, and more urgent ones."""
     alarms: Annotated[list[Text], Field(min_length=1)] = ["*"]
-    """Keys of alarms, also with *, such as mixer/* or line:hall-1."""
+    """Keys of alarms, also with *, such as mixer/*, line:hall-1 or gateway:*."""
     after: Duration = 0.0
     """Only alarms that are not acknowledged for so long."""
     again: Interval | None = None

@@ -125,6 +125,8 @@ class Watch:
                 continue  # behind the end of the list
             of_operators = ("part_of", "shelved", "out_of_service")
             is_end = alarm is not None and not any(one in alarm for one in of_operators)
+            if alarm is not None and is_end and not _has_ended(alarm):
+                continue
             if alarm is not None and is_end and self.rule.ended and not self.told[key].ended:
                 found.append(Notice(What.ENDED, alarm))
             else:
@@ -151,3 +153,9 @@ class Watch:
             if is_night and at < end:
                 day = (day - 1) % 7
         return day in self.rule.days
+
+
+def _has_ended(alarm: Alarm) -> bool:
+    """False if that is not known: the part with the alarms has begun again."""
+    is_reached = "/" not in alarm["alarm"] and alarm["value"] is True
+    return alarm.get("quality") != "bad" and not is_reached

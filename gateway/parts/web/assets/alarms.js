@@ -12,7 +12,7 @@ const EVERY = 4000; // ms between two requests for what is not in the events
 const PAST_EVERY = 10_000; // ms
 const LEVELS = {
   high_high: t("far too high"), high: t("too high"), low: t("too low"), low_low: t("far too low"), on: t("on"), off: t("off"),
-  offline: t("offline"), down: t("down"), silent: t("silent"), stopped: t("stopped"),
+  offline: t("offline"), down: t("down"), silent: t("silent"), stopped: t("stopped"), fault: t("fault"),
 };
 
 let all = [];
@@ -84,7 +84,7 @@ async function showPast(every = 0) {
 
 function why(one) {
   const limit = typeof one.limit === "number" ? ` (${one.limit})` : "";
-  const level = { on: "", off: "", offline: "", down: "", silent: "", stopped: "" }[one.level] ?? `${LEVELS[one.level] ?? ""}${limit}`;
+  const level = { on: "", off: "", offline: "", down: "", silent: "", stopped: "", fault: "" }[one.level] ?? `${LEVELS[one.level] ?? ""}${limit}`;
   const text = one.text ? (one.alarm.includes("/") ? one.text : said(one.text)) : one.alarm; // that of a tag is of the file
   return [text, level].filter(Boolean).join(": ") || LEVELS[one.level];
 }
