@@ -68,8 +68,11 @@ class Told(Silent):
 async def test_a_full_disk_and_a_lost_router_are_told_with_their_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    router = {"connect": ["tcp/10.0.0.1:7447"], "to": []}
-    both = {"history": {"state": "the disk is full"}, "zenoh": router}
+    router: Mapping[str, Any] = {"connect": ["tcp/10.0.0.1:7447"], "to": []}
+    both: Mapping[str, Mapping[str, Any]] = {
+        "history": {"state": "the disk is full"},
+        "zenoh": router,
+    }
     async with Told(tmp_path, monkeypatch) as gateway:
         assert await gateway.told(60) == []
         gateway.wrong = both
