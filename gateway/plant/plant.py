@@ -195,9 +195,6 @@ class Plant:
         """Adds a subscriber. It receives each sample after the earlier subscribers."""
         self._subscribers.append(subscriber)
 
-    def unsubscribe(self, subscriber: Subscriber) -> None:
-        self._subscribers.remove(subscriber)
-
     def forecasts(self, config: Config) -> Sequence[LineForecast]:
         """Returns the forecasts of the lines of another file. A thread may do it."""
         return self._expected.of(config)

@@ -103,12 +103,6 @@ def _members(contract: type) -> set[str]:
     return {name for name in vars(contract) if not name.startswith("_")}
 
 
-def unregister(name: str) -> None:
-    """Removes a protocol, and what is known of its package."""
-    _PROTOCOLS.pop(name, None)
-    _FAULTS.pop(name, None)
-
-
 register(Vigor)
 register(ComputerLink)
 register(ModbusRtu)

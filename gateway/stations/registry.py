@@ -21,11 +21,6 @@ def register(protocol: str, station: Callable[[Any], Station]) -> None:
     _STATIONS[protocol] = station
 
 
-def unregister(protocol: str) -> None:
-    """Removes a protocol."""
-    del _STATIONS[protocol]
-
-
 def can_simulate(driver: AnyDriver) -> bool:
     """Returns True where there is a station for the driver."""
     return driver.protocol in _STATIONS

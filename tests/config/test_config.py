@@ -915,7 +915,6 @@ def test_settings_left_out_are_the_defaults_of_the_protocol(file: Callable[[str]
     (line,) = file(tags("a: {address: D1}")).lines
     (device,) = line.devices
     assert (line.serial.baudrate, line.serial.format) == (19200, "7E1")
-    assert line.simulated
     assert line.port == SimulatorAddress()
     assert not line.echo
     assert device.timing == Vigor().timing
@@ -1203,7 +1202,7 @@ def test_any_file_is_loaded_or_its_mistakes_are_reported(data: Any) -> None:
 def test_the_example_loads_and_runs_without_hardware() -> None:
     config = load(EXAMPLE)
     assert config.name == "demo"
-    assert all(line.simulated for line in config.lines)
+    assert all(line.port == SimulatorAddress() for line in config.lines)
     assert [device.driver.protocol for device in config.devices] == [
         "vigor",
         "computer-link",

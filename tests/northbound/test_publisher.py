@@ -91,7 +91,7 @@ class StuckSession:
         self, key: str, data: bytes, *, timestamp: int, priority: zenoh.Priority, **_how: object
     ) -> None:
         self.hangs.set()
-        assert self.go.wait(5)
+        assert self.go.wait(TIMEOUT)
         self.puts.append((timestamp, key, json.loads(data)["value"]))
         self.documents.append(data)
         self.priorities.append(priority)
@@ -261,6 +261,42 @@ async def test_outcomes_and_alarms_go_before_values_and_documents_that_wait() ->
     urgent, low = zenoh.Priority.INTERACTIVE_HIGH, zenoh.Priority.DATA_LOW
     assert session.priorities == [low, urgent, urgent, urgent, low, low]
     assert publisher.counts()["published"] == 6
+
+
+class HeldSession(StuckSession):
+    """The put of the value 1 waits for `then`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.then = threading.Event(), threading.Event()
+
+    def put(self, key: str, data: bytes, **how: Any) -> None:
+        if json.loads(data)["value"] == 1:
+            self.begun.set()
+            assert self.then.wait(TIMEOUT)
+        super().put(key, data, **how)
+
+
+async def test_outcomes_that_come_while_others_are_put_go_after_them() -> None:
+    """They have one key: a reader that goes by the time stamps would lose those put too late."""
+    session = HeldSession()
+    publisher = a_publisher()
+    publisher.start(session)  # type: ignore[arg-type]
+    publisher.values([mixer().now("mixer/recipe", 0)])
+    await asyncio.to_thread(session.hangs.wait, TIMEOUT)
+    publisher.values([mixer().now("mixer/speed", 9)])
+
+    def outcomes(*values: int) -> None:
+        for value in values:
+            publisher.document(KEYS.writes, f'{{"value": {value}}}'.encode())
+
+    outcomes(1, 2, 3)
+    session.go.set()
+    await asyncio.to_thread(session.begun.wait, TIMEOUT)
+    outcomes(4, 5)
+    session.then.set()
+    await asyncio.to_thread(publisher.stop, TIMEOUT)
+    assert [value for *_, value in session.puts] == [0, 1, 2, 3, 4, 5, 9]
 
 
 async def test_outcomes_beyond_the_limit_are_dropped_and_counted() -> None:

@@ -47,7 +47,8 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     installed(folder, project["project"]["name"], f"{name} = {place}")
     yield folder
     for protocol in ("toy", "broken"):
-        protocols.unregister(protocol)
+        protocols._PROTOCOLS.pop(protocol, None)
+        protocols._FAULTS.pop(protocol, None)
 
 
 def plant(folder: Path, port: str = "simulator", **settings: Any) -> Path:

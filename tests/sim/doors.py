@@ -380,7 +380,7 @@ class Life:
                 raise _Over
         finally:
             self._clock.stop()
-            self.plant.unsubscribe(self)
+            self.plant._subscribers.remove(self)
 
     async def _prove(self) -> None:
         while True:

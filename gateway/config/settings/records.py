@@ -18,7 +18,6 @@ from gateway.transport.port import (
     ListenAddress,
     PortAddress,
     SerialSettings,
-    SimulatorAddress,
     TcpAddress,
     TlsConfig,
 )
@@ -43,10 +42,6 @@ class LineConfig:
     listen_only: bool = False  # another master owns the wire: nothing is ever sent
     not_real: NotReal | None = None  # behind the port; None: real devices
     devices: tuple[DeviceSettings, ...]
-
-    @property
-    def simulated(self) -> bool:
-        return isinstance(self.port, SimulatorAddress)
 
     @property
     def tags(self) -> tuple[Tag, ...]:

@@ -94,6 +94,7 @@ class Publisher:
         self._waiting: dict[Hashable, _Entry] = {}
         self._urgent: dict[Hashable, _Entry] = {}
         self._batch: list[_Entry] = []  # the next one at the end
+        self._others = 0  # entries of the batch that urgent ones go before
         self._waiting_events = 0
         self._handover = Handover(lambda: len(self._waiting) + len(self._batch))
         self._thread: threading.Thread | None = None
@@ -271,7 +272,7 @@ class Publisher:
                     handover.give_back()
                     now = monotonic()
                 before = now
-                if self._urgent:
+                if self._urgent and len(batch) <= self._others:  # the outcomes keep their order
                     self._next_batch()
                     before = monotonic()
 
@@ -284,9 +285,9 @@ class Publisher:
             while not (self._waiting or self._urgent or self._handover.closing):
                 self._handover.rest()
             if self._urgent:
-                waiting, self._urgent = self._urgent, {}
+                waiting, self._urgent, self._others = self._urgent, {}, len(self._batch)
             else:
-                waiting, self._waiting = self._waiting, {}
+                waiting, self._waiting, self._others = self._waiting, {}, len(self._waiting)
                 self._waiting_events = 0
             self._batch += reversed(waiting.values())
             return bool(waiting)
