@@ -781,6 +781,12 @@ TAGS = [
         f"13: {M}.tags.: a name needs at least one character",
     ),
     bad(
+        "long tag names",
+        tags(f"{'a' * 200}: {{address: D1}}", f"{'水' * 67}: {{address: D2}}"),
+        f"9: {M}.tags.{'水' * 67}: '{'水' * 67}' has 201 bytes in UTF-8, and a name at most 200: "
+        "shorten it",
+    ),
+    bad(
         "duplicate tag",
         tags("a: {address: D1}", "b: {address: D2}", "a: {address: D3}"),
         f"8: {M}.tags.a: written twice, here and again in line 10: only one of them can be meant",

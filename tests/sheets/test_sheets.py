@@ -180,6 +180,7 @@ def test_an_address_is_required_and_a_name_or_a_comment(text: str, what: str) ->
     assert [mistake.what for mistake in sheet(text).mistakes] == [what]
     named = sheet("Address,Comment\nD1,Motor speed\n")
     assert named.tags == {"Motor_speed": {"address": "D1", "description": "Motor speed"}}
+    assert [*sheet(f"Address,Comment\nD1,{'long ' * 50}\n").tags] == ["D1"]  # too long for a name
     assert named.mistakes == []
 
 

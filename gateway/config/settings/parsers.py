@@ -45,6 +45,8 @@ BAUDRATES = (
     *(76800, 115200, 128000, 187500, 230400, 250000, 256000, 460800, 500000, 576000, 921600),
     *(1000000, 1152000, 1500000, 2000000, 2500000, 3000000, 3500000, 4000000),
 )
+# Bytes in UTF-8: a name is part of the name of a file, which has at most 255.
+LONGEST_NAME = 200
 _LONGEST_TIME = 3650 * 86400.0  # ten years; more is a mistake, and clocks overflow
 
 DURATIONS = "500ms, 2s, 15min, 1h30m or 7d"
@@ -118,6 +120,9 @@ def name(text: object, *, slashes: bool = False) -> str:
             )
     if slashes and ("" in text.split("/")):
         raise ConfigError(f"{text!r}: a `/` separates two parts of a name and cannot be at its end")
+    if (octets := len(text.encode())) > LONGEST_NAME:
+        long = f"{shown(text)} has {octets} bytes in UTF-8"
+        raise ConfigError(f"{long}, and a name at most {LONGEST_NAME}: shorten it")
     return text
 
 

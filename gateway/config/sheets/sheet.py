@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from gateway.config.settings.parsers import LONGEST_NAME
 from gateway.config.sheets import cells
 from gateway.config.sheets.columns import Column, Columns, columns_of, unusable
 from gateway.config.sheets.grid import Grid, Row
@@ -188,6 +189,8 @@ class _Reader:
             return ""
         address = texts.get("address", "")
         name = cells.name(texts.get("description") or address)
+        if len(name.encode()) > LONGEST_NAME:
+            name = cells.name(address)
         return f"{name}_{cells.name(address)}" if name in self.sheet.tags else name
 
     def _settings(self, row: int, texts: Texts) -> dict[str, object]:
