@@ -10,14 +10,15 @@ import pytest
 
 from gateway.engine.device.device import Device
 from gateway.errors import LineDown
+from gateway.line.groups import ended
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.modbus import (
     MbapCodec,
     ModbusTcp,
 )
-from gateway.tags import Quality, Reason
+from gateway.tags import Quality, Reason, WriteResult
 from gateway.transport import Receiver
-from tests.line.slaves import NETWORK, plant, registers, slave
+from tests.line.slaves import NETWORK, plant, registers, slave, writable
 from tests.sim.bench import Bench
 from tests.sim.plant import Plant, running
 from tests.sim.virtual import now, on_virtual_time
@@ -220,3 +221,25 @@ async def test_a_bridge_works_through_its_queue_before_it_gets_more() -> None:
         assert dev.record.failures.total() == failures
     assert len(queue.kept) <= 1
     assert witness.wrong == []
+
+
+@on_virtual_time
+async def test_a_write_that_was_waited_for_too_long_comes_before_the_next_one() -> None:
+    """Its client hears that it may yet be done; the next one ends with its own reply; `hostile`
+    seed 2700022."""
+    driver = ModbusTcp(window=1)
+    tag, _ = writable(driver)
+    dev = slave(driver, [tag], wire=NETWORK, reply_timeout=5.0)
+    line, bench, _ = network(dev, latency=lambda n: 1.0 if n else 0.02)
+    async with running(line):
+        while not line.good(dev):
+            await asyncio.sleep(0.01)
+        first = await ended(line.line.write_group(dev, [(tag, [7])]), 0.1)
+        begun = len(bench.answered)
+        second = await ended(line.line.write_group(dev, [(tag, [8])]), 9.0)
+    assert [str(end) for end in first] == ["not acknowledged within 0.1 s: it may yet be done"]
+    assert isinstance(second[0], WriteResult)
+    writes = [data[-1] for _, data in bench.sent if data[7] == 6]
+    assert writes == [7, 8]
+    assert len(bench.answered) >= begun + 2
+    assert line.stations[0].inner.memory.read("holding", 5, 1, now()) == [8]

@@ -55,6 +55,10 @@ class DeviceServer:
     def backlog(self) -> int:
         return len(self._kept)
 
+    def keeps_replies(self, station: "Speaker") -> bool:
+        """Returns True while replies of the station, also older ones, wait for others."""
+        return station in self._replies
+
     def flow(self) -> None:
         """Ends the stall."""
         self.stalled = False

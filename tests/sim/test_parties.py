@@ -5,16 +5,21 @@ from pathlib import Path
 
 import pytest
 
+from gateway.errors import Busy, GatewayError, Unclear
 from gateway.protocols.checksums import byte_sum
 from gateway.protocols.vigor.codec import Request, encode
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
+from gateway.tags import WriteResult
+from gateway.tags.transfer import TransferRule
 from tests.sim import campaign
 from tests.sim.foreign import Foreign
 from tests.sim.freezer import Ear, Freezer
 from tests.sim.manners import Holes, is_unknown, refusal
+from tests.sim.plant import make_tag
 from tests.sim.requests import shape_of
+from tests.sim.transfers import MAY_COME, Row
 from tests.sim.virtual import now, on_virtual_time
 
 ASK, LIKE, OTHER = b"A1", b"A2", b"B1"  # the letter is the shape
@@ -155,3 +160,28 @@ def test_a_campaign_continues_where_it_ended(
     monkeypatch.setattr("sys.argv", ["campaign", "--total", result])
     assert campaign.main() == 0
     assert capsys.readouterr().out.startswith("lean: 2 seeds, 0.02 hours")
+
+
+DONE = WriteResult(1, 0, 0.1)
+LATER = Unclear(f"not acknowledged within 8 s: it {MAY_COME}")
+
+
+@pytest.mark.parametrize(
+    ("end", "obeyed", "own"),
+    [
+        (DONE, 2, 1),  # the older one, then this one
+        (DONE, 3, 2),  # one of them twice
+        (DONE, 1, 1),
+        (Busy("not sent"), 1, 0),  # the older one
+        (Busy("not sent"), 2, 1),
+    ],
+)
+def test_a_transfer_that_may_yet_be_done_is_no_second_write(
+    end: WriteResult | GatewayError, obeyed: int, own: int
+) -> None:
+    """`hostile` seed 2700022."""
+    rule = TransferRule(number=1, source="a/x", target="b/y", text=("a/x", "b/y"))
+    row = Row(rule, make_tag("D1"))
+    assert row.own(LATER, 0) == 0
+    assert row.own(end, obeyed) == own
+    assert row.own(DONE, 2) == 2  # nothing of before is open any more

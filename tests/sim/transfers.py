@@ -26,12 +26,13 @@ from tests.sim.obeyed import all_times, counts, most_requests, times
 SPOKEN = 1.5  # seconds: the longest write, with a resync before and after, and the read before it
 LOOP = 0.01  # seconds: the moments of two writes are seen a little later
 LOOK = 20.0  # seconds between two looks at the states
+MAY_COME = "may yet be done"  # the end of a write that nothing waits for any longer
 _DONE = WriteResult.__name__
 _NO_CHANCE = random.Random(0)  # for clients that draw nothing
 
 
 @dataclass(eq=False)
-class _Row:
+class Row:
     """What the judge knows of a row. Times by the loop's clock."""
 
     rule: TransferRule
@@ -45,7 +46,19 @@ class _Row:
     tried: bool = False  # another one after it, which was not done
     changed_at: float = 0.0  # when the source was published with another good value
     seen: Value | None = None
+    open: int = 0  # its writes that ended, and may yet be done
     ends: Counter[str] = field(default_factory=Counter)
+
+    def own(self, end: WriteResult | GatewayError, obeyed: int) -> int:
+        """Returns how often the PLC obeyed the write that ended now.
+
+        `obeyed`: how often since it began, also an older write that nothing waits for any longer.
+        The line keeps their order: with an acknowledged one all older ones have ended.
+        """
+        done = isinstance(end, WriteResult)
+        older = min(self.open, max(0, obeyed - done))
+        self.open = 0 if done else self.open - older + (MAY_COME in str(end))
+        return obeyed - older
 
 
 @dataclass(eq=False)
@@ -56,13 +69,13 @@ class Carrier:
     buses: Mapping[str, Bus]  # by device
     devices: Mapping[str, Device]
     outcomes: list[bytes] = field(default_factory=list)
-    rows: dict[str, _Row] = field(default_factory=dict)
+    rows: dict[str, Row] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         gateway = self.judge.gateway
         rules = gateway.config.transfers
         tags = {tag.key: tag for tag in self.judge.known}
-        self.rows = {f"transfer {rule.number}": _Row(rule, tags[rule.source]) for rule in rules}
+        self.rows = {f"transfer {rule.number}": Row(rule, tags[rule.source]) for rule in rules}
         own = OwnWrites(Keys("plant", "demo"), gateway, Audit(self.outcomes.append))
         self._plain = own.write
         self.transfers = Transfers(gateway, self.write, rules)
@@ -98,7 +111,8 @@ class Carrier:
         read_at = judge.read_at.get(row.source, since)
         known, held = counts(station, tag), shown(tag, station.holds(tag))
         self._count(tag, self.buses[tag.device].carrying)
-        row.writing, before = True, (row.written, row.at, row.sure, row.instead)
+        row.writing = True
+        before = row.written, row.at, row.sure, row.instead, row.early
         row.written, row.at, row.sure, row.instead = value, since, False, not fresh
         row.early = early
         try:
@@ -109,14 +123,14 @@ class Carrier:
         row.writing, row.sure = False, isinstance(end, WriteResult)
         row.tried = isinstance(end, (*NOT_SENT, Refused, BadValue))
         if row.tried:
-            row.written, row.at, row.sure, row.instead = before
+            row.written, row.at, row.sure, row.instead, row.early = before
         row.ends[type(end).__name__] += 1
         judge.story.counts[f"carried {type(end).__name__}"] += 1
         self.buses[tag.device].note("carried", by, value, type(end).__name__)
         if fresh and not early:  # a substitute has no age
             self._judge_age(row, tag, since, read_at)
         client = Client(self.devices[tag.device], judge, self.buses[tag.device], _NO_CHANCE, 1.0)
-        obeyed = times(station, tag, known)
+        obeyed = row.own(end, times(station, tag, known))
         await client.judge_end(tag, value, end, Asked(since, 0, True, held), obeyed)
         if isinstance(end, GatewayError):
             raise end
@@ -126,18 +140,18 @@ class Carrier:
         number = self.buses[tag.device].number_of(self.devices[tag.device])
         counter[number] += most_requests(tag)
 
-    def _fresh(self, row: _Row) -> bool:
+    def _fresh(self, row: Row) -> bool:
         sample = self.judge.gateway.mirror[row.source]
         age = self.judge.now - self.judge.read_at.get(row.source, -math.inf)
         return sample.quality is Quality.GOOD and age < row.rule.stale
 
-    def _may_be_stale(self, row: _Row) -> bool:
+    def _may_be_stale(self, row: Row) -> bool:
         """The gateway may count the age from an earlier read: after a new plan from the oldest one
         of all tags that are read together now."""
         age = self.judge.now - self.judge.read_at.get(row.source, -math.inf)
         return age >= row.rule.stale - 2 * row.source.every  # the oldest may be late itself
 
-    def _judge_value(self, row: _Row, value: Value, *, fresh: bool) -> None:
+    def _judge_value(self, row: Row, value: Value, *, fresh: bool) -> None:
         judge, rule, name = self.judge, row.rule, f"transfer {row.rule.number}"
         sample = judge.gateway.mirror[row.source]
         read_at = judge.read_at.get(row.source, judge.began)
@@ -159,7 +173,7 @@ class Carrier:
             elif row.changed_at < row.at:
                 judge.broke(f"{name} carried {value!r} again, but the source did not change")
 
-    def _judge_age(self, row: _Row, tag: Tag, since: float, read_at: float) -> None:
+    def _judge_age(self, row: Row, tag: Tag, since: float, read_at: float) -> None:
         """Checks the age of the value when the PLC got it."""
         judge, bus = self.judge, self.buses[tag.device]
         client = Client(self.devices[tag.device], judge, bus, _NO_CHANCE, 1.0)
@@ -179,7 +193,7 @@ class Carrier:
             for row in self.rows.values():
                 self._look(row, documents[f"transfers/{row.rule.number}"])
 
-    def _look(self, row: _Row, said: Mapping[str, object]) -> None:
+    def _look(self, row: Row, said: Mapping[str, object]) -> None:
         fresh, state = self._fresh(row), said["state"]
         self.judge.story.counts[f"transfers {state}"] += 1
         right = state == "starting" if not row.ends else fresh is (state != "stale")
