@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from gateway.cli.line import scan as scanning
 from gateway.cli.line import scan_command as show
 from gateway.cli.line.scan import Plan, Report, planned, scan
 from gateway.errors import ConfigError, LineDown
@@ -14,6 +15,7 @@ from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
 from gateway.transport import Port, Receiver, SerialSettings
+from tests.cli.conftest import Command
 from tests.protocols.test_swapped import over_swapped_wires
 from tests.sim.virtual import on_virtual_time
 
@@ -205,6 +207,28 @@ async def test_a_lost_port_ends_the_scan() -> None:
     with pytest.raises(LineDown, match="unplugged"):
         await scan(sought(line, "vigor"))
     assert line.closed == 1
+
+
+def test_the_command_prints_what_replied_before_the_port_was_lost(
+    monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    class Later(Unplugged):
+        def write(self, data: bytes) -> None:
+            lost = len(self.heard) > 2
+            (Unplugged if lost else OldLine).write(self, data)
+
+    line = Later(VigorStation(1))
+
+    async def opened(_port: object, settings: SerialSettings, ear: Receiver) -> Port:
+        return await line.open(settings, ear)
+
+    monkeypatch.setattr(scanning, "open_port", opened)
+    monkeypatch.setattr(show, "set_up", lambda *_: None)  # needs a real stderr
+    asked = ("scan", "--port", "/dev/ttyS9", "--protocol", "vigor", "--baud", "19200")
+    done = command(*asked)
+    assert done.code == 1
+    assert "station-1: {protocol: vigor, station: 1, tags: {}}" in done.out
+    assert done.err.endswith("/dev/ttyS9: unplugged\n")
 
 
 @pytest.mark.parametrize(

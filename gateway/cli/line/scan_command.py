@@ -37,8 +37,15 @@ def scan(
     Sends only requests that change nothing. No gateway may be running at that port.
     """
     plan = scanning.planned(port, protocol, stations, baud, serial_format, timeout)
-    report = scanned(plan, f"no station replied at {port}")
-    if not as_json:
+    report = Report()
+    try:
+        scanned(plan, f"no station replied at {port}", report)
+    finally:  # also what replied before the port was lost, or Ctrl-C
+        _print(report, port, as_json=as_json)
+
+
+def _print(report: Report, port: str, *, as_json: bool) -> None:
+    if report.found and not as_json:
         print(found_stations(report, port))
         return
     for found in report.found:
@@ -48,11 +55,11 @@ def scan(
         print(json.dumps({"port": port, **line, **_device(found), "refusal": found.refusal}))
 
 
-def scanned(plan: scanning.Plan, none_replied: str) -> Report:
+def scanned(plan: scanning.Plan, none_replied: str, report: Report | None = None) -> Report:
     """Scans; ends the command with the sentence `none_replied` if no station replied."""
     set_up(LogFormat.TEXT, LogLevel.ERROR)
     with progress(err) as share:
-        report = asyncio.run(scanning.scan(plan, err.print, share))
+        report = asyncio.run(scanning.scan(plan, err.print, share, report))
     for sentence in noises(report):
         err.print(sentence)
     if not report.found:
