@@ -7,7 +7,7 @@ from gateway.engine.device.health import FORGOTTEN
 from gateway.engine.device.identity import SILENT_FOR
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
-from gateway.engine.device.probe_pace import ALIVE_FOR, PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.probe_pace import ALIVE_FOR, LATE_FOR, PROBE_PAUSE, PROBE_SPREAD
 from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
 from gateway.engine.device.turnaround import LEARN_EVERY
@@ -172,6 +172,13 @@ BELIEFS = (
         "ten minutes",
         "their replies have a form that was not requested for long",
         WARY_FOR,
+    ),
+    Belief(
+        "a station replies later than late_guard",
+        "a reply of the station behind all requests",
+        "a minute without one",
+        "a form that was requested in twice that time proves nothing",
+        LATE_FOR,
     ),
     Belief(
         "a device that returns is as quick as before",

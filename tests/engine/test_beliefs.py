@@ -356,6 +356,14 @@ def silent_about_seconds() -> Way:
     return lambda after: pace.seconds_from <= HOUR + after
 
 
+def later_than_its_guard() -> Way:
+    health = link_device().health
+    health.left_outstanding(None, HOUR)
+    health.spoke(HOUR + 0.5, 1.0)
+    assert health.probes.may_answer_from(HOUR + 1.0) < HOUR + 1.0
+    return lambda after: health.probes.may_answer_from(HOUR + 0.5 + after) == HOUR + 0.5 + after
+
+
 def as_quick_as_before() -> Way:
     health, now = link_device().health, HOUR
     health.unclear(SILENCE, None, now)
@@ -394,6 +402,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "noise destroys its replies": noise,
     "the device lacks a read with a form of its own": no_form_of_its_own,
     "the device is silent about second requests of resyncs": silent_about_seconds,
+    "a station replies later than late_guard": later_than_its_guard,
     "a device that returns is as quick as before": as_quick_as_before,
     "earlier requests are kept": kept_requests,
 }

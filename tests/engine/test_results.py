@@ -28,6 +28,7 @@ from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import plan
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Span
+from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Quality, Reason
 from tests.engine.rig import REPLIED, SILENCE, Rig, link_device, tcp_device
 from tests.sim.bench import WIRE
@@ -520,3 +521,23 @@ def test_the_line_is_quiet_before_a_probe_that_may_have_an_older_reply_is_repeat
     rig.conclude(settle, Settled(None, quiet=False))
     assert rig.device.health.needs_resync
     assert "never quiet" in str(rig.device.health.trouble)
+
+
+def test_a_probe_of_a_station_that_is_too_late_is_not_repeated() -> None:
+    driver = ModbusRtu(station=1)
+    tags = [make_tag(f"holding:{n}", driver, device="plc") for n in range(3)]
+    rig = Rig(made_device("plc", driver, WIRE, driver.timing, tags))
+    rig.bring(State.ONLINE)
+    for _ in range(2):
+        rig.fail(rig.transacted())
+    probe = rig.transacted()
+    assert rig.device.shapes is not None
+    for size in (1, 2, 3):
+        rig.device.shapes.also_sent(driver.reply_shape(Span("holding", 0, size)), rig.now)
+    rig.device.health.probes.replied_behind(rig.now, 1.0)
+    rig.conclude(probe, Resynced(0))
+    settle = rig.transacted()
+    assert isinstance(settle, Settle)
+    rig.conclude(settle, Settled(None, quiet=True))
+    assert rig.device.health.needs_resync
+    assert "so late" in str(rig.device.health.trouble)

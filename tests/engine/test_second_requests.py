@@ -1,6 +1,7 @@
 """The second request of a resync: its reply has the form that was requested longest ago."""
 
 from gateway.engine.device.device import Device as EngineDevice
+from gateway.engine.device.probe_pace import LATE_FOR, LATE_MOST
 from gateway.engine.results.second_requests import (
     MOST_SILENT,
     is_like_a_second,
@@ -26,13 +27,19 @@ def form(device: EngineDevice, outstanding: Span | None, token: int) -> object:
     return device.shapes.of_resync(outstanding, token, device.probe_spans)
 
 
+def chosen(device: EngineDevice, token: int, now: float) -> int:
+    found = second_token(device, None, token, now)
+    assert found is not None
+    return found
+
+
 def test_it_has_the_form_that_was_requested_longest_ago() -> None:
     plc, forms = made(*ROW), []
     assert plc.shapes is not None
     for now in range(8):
         token = plc.health.next_probe_token()
         plc.shapes.probed(None, token, plc.probe_spans, now)
-        forms.append(form(plc, None, second_token(plc, None, token + 1, now)))
+        forms.append(form(plc, None, chosen(plc, token + 1, now)))
         assert forms[-1] != form(plc, None, token)
     assert len(set(forms)) == 2  # two registers and four: first requests read one and three
 
@@ -42,7 +49,7 @@ def test_it_has_not_the_form_of_what_a_program_reads() -> None:
     assert plc.shapes is not None
     for size in (1, 2, 3):
         plc.shapes.also_sent(plc.shapes.of(Span("holding", 700, size)), 5.0)
-    token = second_token(plc, None, plc.health.next_probe_token() + 1, 6.0)
+    token = chosen(plc, plc.health.next_probe_token() + 1, 6.0)
     assert form(plc, None, token) == plc.shapes.of(Span("holding", 700, 4))
 
 
@@ -54,10 +61,10 @@ def test_a_device_with_single_registers_gets_the_first_choice() -> None:
 def test_a_device_that_is_silent_about_it_gets_the_first_choice() -> None:
     plc = made(*SEVERAL)
     plc.note_resync(None, 3, 0.5)
-    chosen = second_token(plc, None, 3, 1.0)
-    assert chosen != 3
+    second = chosen(plc, 3, 1.0)
+    assert second != 3
     for _ in range(MOST_SILENT):
-        leave_second(plc, None, chosen, 1.0)
+        leave_second(plc, None, second, 1.0)
     assert second_token(plc, None, 3, 2.0) == 3
 
 
@@ -78,3 +85,37 @@ def test_a_later_resync_of_its_form_proves_nothing_until_one_is_answered() -> No
     assert any(not is_like_a_second(plc, None, token) for token in range(8, 40, 2))
     plc.health.answered(resynced=True)
     assert not any(is_like_a_second(plc, None, token) for token in alike)
+
+
+def late(by: float) -> EngineDevice:
+    """Returns a device with one unanswered request, at 0, and a reply `by` seconds later."""
+    plc = made(*ROW)
+    plc.health.left_outstanding(None, 0.0)
+    plc.health.spoke(by, plc.longest_reply)
+    assert plc.shapes is not None
+    for size in (1, 2, 3, 4):
+        plc.shapes.also_sent(plc.shapes.of(Span("holding", 0, size)), by + size / 10)
+    return plc
+
+
+def test_a_form_that_a_late_station_may_still_answer_is_not_asked_for() -> None:
+    plc = late(0.5)
+    first = 0.5 + 0.1  # when the form of one register was requested
+    assert second_token(plc, None, 3, first + 2 * 0.5 - 0.01) is None
+    token = chosen(plc, 3, first + 2 * 0.5 + 0.01)
+    assert form(plc, None, token) == ModbusRtu(station=1).reply_shape(Span("holding", 0, 1))
+
+
+def test_another_master_makes_no_station_late_for_ever() -> None:
+    plc = late(30.0)
+    assert second_token(plc, None, 3, 30.1 + 2 * LATE_MOST - 0.01) is None
+    assert second_token(plc, None, 3, 30.1 + 2 * LATE_MOST + 0.01) is not None
+
+
+def test_a_minute_without_a_late_reply_ends_it() -> None:
+    plc = late(0.5)
+    now = 0.5 + LATE_FOR
+    assert plc.shapes is not None
+    for size in (1, 2, 3, 4):
+        plc.shapes.also_sent(plc.shapes.of(Span("holding", 0, size)), now)
+    assert second_token(plc, None, 3, now) is not None

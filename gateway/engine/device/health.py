@@ -245,6 +245,8 @@ class Health:
 
     def spoke(self, now: float, longest_reply: float) -> None:
         """Notes a sound frame, perhaps of an offline device."""
+        if self.unanswered.sent:
+            self.probes.replied_behind(now, now - self.unanswered.sent[-1])
         if self.state is State.OFFLINE:
             self.probes.spoke(now, longest_reply)
 

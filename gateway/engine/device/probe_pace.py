@@ -6,6 +6,7 @@ from dataclasses import dataclass
 PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
 PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
 LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
+LATE_MOST = 1.0  # seconds by which a reply is known to be late, at most: another master may ask
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
 PROBE_SPREAD = 0.1  # share by which it varies
 MOST_BEHIND = 30.0  # seconds for which no probe is sent, because older ones wait at a server
@@ -23,6 +24,8 @@ class ProbePace:
     _last: float = -math.inf  # of an offline device
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
     _last_late: float = -math.inf  # a late reply, or one to an older request
+    _late_by: float = 0.0  # seconds that a reply came behind the last request, at least
+    _late_seen: float = -math.inf  # when it did
 
     def restart(self) -> None:
         self.short = 0
@@ -56,6 +59,17 @@ class ProbePace:
     def was_late(self, now: float) -> bool:
         """Returns True if a reply of the device came late in the last minute."""
         return now - self._last_late < LATE_FOR
+
+    def replied_behind(self, now: float, took: float) -> None:
+        """Notes a reply to an older request, `took` seconds after the last one ended."""
+        if now - self._late_seen >= LATE_FOR:
+            self._late_by = 0.0
+        self._late_by, self._late_seen = max(self._late_by, min(took, LATE_MOST)), now
+
+    def may_answer_from(self, now: float) -> float:
+        """Returns the time of the first request that may still be answered: twice as old as the
+        latest reply of the last minute was late."""
+        return now - 2 * self._late_by if now - self._late_seen < LATE_FOR else now
 
     def spoke(self, now: float, longest_reply: float) -> None:
         """Notes a sound frame while it was offline: it replies later than a short probe waits."""

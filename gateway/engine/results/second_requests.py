@@ -2,7 +2,8 @@
 
 A station later than `late_guard` may still reply to earlier requests. So the second request reads
 the form that was requested longest ago. One without a reply is remembered: its form is none of the
-row of resyncs, from which a reply is told otherwise.
+row of resyncs, from which a reply is told otherwise. A station that was later than that is not
+asked: each form may still be the reply to an earlier request.
 """
 
 import math
@@ -14,11 +15,11 @@ MOST_SILENT = 2  # second requests without a reply, until only the first choice 
 MOST_TOKENS = 32  # among which the second request of a resync is chosen
 
 
-def second_token(device: Device, outstanding: Span | None, token: int, now: float) -> int:
+def second_token(device: Device, outstanding: Span | None, token: int, now: float) -> int | None:
     """Returns the token of a second request: the one whose form was requested longest ago.
 
     `token`: the first choice, also where no read inside the spans has another form, or the device
-    is silent about it.
+    is silent about it. None: a request of this form may still be answered.
     """
     shapes, spans = device.shapes, device.probe_spans
     if shapes is None or now < shapes.proofs.seconds_from:
@@ -29,6 +30,8 @@ def second_token(device: Device, outstanding: Span | None, token: int, now: floa
         shape = shapes.of_resync(outstanding, one, spans)
         if shape in inside and (at := shapes.used_at(shape)) < longest_ago:
             found, longest_ago = one, at
+    if device.health.probes.may_answer_from(now) < longest_ago < math.inf:
+        return None
     device.note_resync(outstanding, found, now)
     return found
 
