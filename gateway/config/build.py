@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config.line_rules import check_line, line_wire, modem_of, origin_of
-from gateway.config.messages import Mistakes, Path, meant, one_of, shown
+from gateway.config.messages import Mistakes, meant, one_of, shown
 from gateway.config.port_rules import check_device_servers, port_of
 from gateway.config.settings import parsers
 from gateway.config.settings.model import DeviceSection, LineSection
@@ -72,24 +72,24 @@ class Builder:
     _sheets: SheetTags = field(init=False)
 
     def __post_init__(self) -> None:
-        self._tags = DeviceTags(self.mistakes)
-        self._sheets = SheetTags(self.mistakes, self.folder, grids=dict(self.imports.values()))
+        self._tags = DeviceTags()
+        self._sheets = SheetTags(self.folder, grids=dict(self.imports.values()))
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """Returns the whole file; None, after mistakes, where no part could be made."""
-        top = section(file_section(), data, (), self.mistakes, "the file")
+        top = section(file_section(), data, self.mistakes, "the file")
         raw_lines = data.get("lines")
-        defaults = self._defaults(data, (), TagDefaults())
+        defaults = _defaults(data, self.mistakes, TagDefaults())
         lines = []
         self._count = sum(len(mapping(_devices_of(raw))) for _, raw in mapping(raw_lines))
         for name, raw in mapping(raw_lines):
-            path: Path = ("lines", name)
-            line = self._line(self._name(name, path), raw, path, defaults)
+            own = self.mistakes.at("lines", name)
+            line = self._line(_name(name, own), raw, own, defaults)
             if line is not None:
                 lines.append(line)
         if raw_lines == {}:
-            self.mistakes.add(("lines",), "no lines: a gateway has at least one")
-        lines = with_computed(lines, self._tags.computed, self.mistakes)
+            self.mistakes.add("no lines: a gateway has at least one", "lines")
+        lines = with_computed(lines, self._tags.computed)
         self._check_ports(lines, raw_lines)
         if top is not None and top.gateway.standby is not None:
             check_totals(lines, self.mistakes)
@@ -115,11 +115,11 @@ class Builder:
             audit_file=self._kept(top.gateway.audit, AUDIT_FILE),
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
-            secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
-            writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
+            secret_file=self._file(top.gateway.secret_file, "gateway", "secret_file"),
+            writers_file=self._file(top.writers.file, "writers", "file") if top.writers else None,
             folder=self.state_folder or self.folder,
             writers_state=self._written(WRITERS_STATE) if top.writers else None,
-            zenoh=with_files(top.zenoh.record(), self.folder, self.mistakes),
+            zenoh=with_files(top.zenoh.record(), self.folder, self.mistakes.at("zenoh")),
             parts=placed(top, place),
             lines=tuple(lines),
             transfers=transfers,
@@ -127,45 +127,46 @@ class Builder:
             sheets=tuple(self._sheets.used),
         )
 
-    def _line(self, name: str, raw: object, path: Path, outer: TagDefaults) -> LineConfig | None:
-        line = section(LineSection, raw, path, self.mistakes, "a line")
+    def _line(
+        self, name: str, raw: object, mistakes: Mistakes, outer: TagDefaults
+    ) -> LineConfig | None:
+        line = section(LineSection, raw, mistakes, "a line")
         if not isinstance(raw, dict):
             return None
-        defaults = self._defaults(raw, path, outer)
-        not_real = None if line is None else origin_of(line, path, self.mistakes)
+        defaults = _defaults(raw, mistakes, outer)
+        not_real = None if line is None else origin_of(line, mistakes)
         devices = []
         for device_name, raw_device in mapping(raw.get("devices")):
-            place: Path = (*path, "devices", device_name)
-            checked = self._name(device_name, place)
+            own = mistakes.at("devices", device_name)
+            checked = _name(device_name, own)
             if checked in self._devices:
-                self.mistakes.add(
-                    place,
+                own.add(
                     f"a device {checked} is already on line {self._devices[checked]}: "
-                    "a name is used once in the file, it is the key of the values",
+                    "a name is used once in the file, it is the key of the values"
                 )
             self._devices.setdefault(checked, name)
             serve = line is not None and line.serve
             device = self._device(
-                checked, raw_device, place, defaults, serve=serve, not_real=not_real
+                checked, raw_device, own, defaults, serve=serve, not_real=not_real
             )
             if device is not None:
                 devices.append(device)
             if self.report is not None:
                 self.report(len(self._devices) / self._count)
         if raw.get("devices") == {}:
-            self.mistakes.add((*path, "devices"), "no devices: a line has at least one")
+            mistakes.add("no devices: a line has at least one", "devices")
         if line is None:
             return None
-        check_line(line, devices, path, self.mistakes)
+        check_line(line, devices, mistakes)
         if line.serve:
-            check_served_line(line, devices, path, self.mistakes)
-        serial, wire = line_wire(line, devices, path, self.mistakes)
-        modem = modem_of(line, raw.get("modem"), wire, path, self.mistakes)
+            check_served_line(line, devices, mistakes)
+        serial, wire = line_wire(line, devices, mistakes)
+        modem = modem_of(line, raw.get("modem"), wire, mistakes)
         if modem is not None and line.serve:
             devices = [until_the_next_call(one, raw) for one in devices]
         return LineConfig(
             name=name,
-            port=port_of(line, self.folder, path, self.mistakes),
+            port=port_of(line, self.folder, mistakes),
             serial=serial,
             wire=wire,
             echo=line.echo,
@@ -183,30 +184,28 @@ class Builder:
         self,
         name: str,
         raw: object,
-        path: Path,
+        mistakes: Mistakes,
         outer: TagDefaults,
         *,
         serve: bool,
         not_real: NotReal | None,
     ) -> DeviceSettings | None:
         if not isinstance(raw, dict):
-            section(DeviceSection, raw, path, self.mistakes, "a device")
+            section(DeviceSection, raw, mistakes, "a device")
             return None
         common = {key: value for key, value in raw.items() if key in DeviceSection.model_fields}
         own = {k: v for k, v in raw.items() if k not in common and k not in _OTHERS}
-        settings = section(DeviceSection, common, path, self.mistakes, "a device")
-        driver = self._driver(raw.get("protocol"), own, path)
-        defaults = self._defaults(raw, path, outer)
+        settings = section(DeviceSection, common, mistakes, "a device")
+        driver = _driver(raw.get("protocol"), own, mistakes)
+        defaults = _defaults(raw, mistakes, outer)
         addressing = ServedView(driver) if serve and driver is not None else driver
         self._intervals[name] = defaults.every
-        place: Path = (*path, "tags")
-        tags = self._tags.build(
-            name, raw.get("tags"), place, defaults, addressing, not_real=not_real
-        )
+        own_tags = raw.get("tags"), mistakes.at("tags")
+        tags = self._tags.build(name, *own_tags, defaults, addressing, not_real=not_real)
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
         for sheet in filter(None, (own_sheet, self.imports.get(name, (None,))[0])):
-            place, taken = (*path, "tags_from"), {tag.name for tag in tags}
+            place, taken = mistakes.at("tags_from"), {tag.name for tag in tags}
             tags += self._sheets.build(
                 name, sheet, place, defaults, addressing, taken, not_real=not_real
             )
@@ -215,11 +214,11 @@ class Builder:
         served = None
         if serve:
             rest = [sheet.raw for sheet in self._sheets.used[sheets:]]
-            device = ServedDevice(driver, settings, raw, rest, defaults, path, self.mistakes)
+            device = ServedDevice(driver, settings, raw, rest, defaults, mistakes)
             served, tags = device.build(tags)
         else:
-            only_served(raw, path, self.mistakes)
-            check_overlaps(driver, tags, (*path, "tags"), self.mistakes)
+            only_served(raw, mistakes)
+            check_overlaps(driver, tags, mistakes.at("tags"))
         default = driver.timing
         own_times = {name: getattr(settings, name) for name in _TIMES}
         timing = replace(
@@ -227,7 +226,7 @@ class Builder:
             **{name: given for name, given in own_times.items() if given is not None},
             learn_silence=default.learn_silence and settings.silence is None,
         )
-        self._check_identity(settings.identity or {}, driver, tags, (*path, "identity"))
+        _check_identity(settings.identity or {}, driver, tags, mistakes.at("identity"))
         late_guard = settings.late_guard
         return DeviceSettings(
             name=name,
@@ -244,55 +243,6 @@ class Builder:
             tags=tags,
             served=served,
         )
-
-    def _check_identity(
-        self, names: Collection[str], driver: AnyDriver, tags: Sequence[Tag], path: Path
-    ) -> None:
-        if not names:  # as of most devices
-            return
-        own = driver.identity_names if isinstance(driver, Identifies) else ()
-        areas = driver.areas
-        read = [tag for tag in tags if replace(tag.origin, not_real=None) == READ and tag.polled]
-        known = {tag.name for tag in read if areas[tag.span.area].readable}
-        for name in set(names) - known - set(own):
-            also = f", or {one_of(sorted(own))}" if own else ""
-            self.mistakes.add(
-                (*path, name),
-                f"a {driver.protocol} device does not tell {name}: name a tag of it that is read, "
-                f"such as one with its serial number{also}",
-            )
-
-    def _driver(self, protocol: object, own: dict[str, Any], path: Path) -> AnyDriver | None:
-        place = (*path, "protocol")
-        if protocol is None:
-            self.mistakes.add(place, f"missing: a device needs its protocol: {protocols()}")
-            return None
-        if not isinstance(protocol, str) or protocol not in PROTOCOLS:
-            fault = fault_of(str(protocol))
-            hint = meant(str(protocol), PROTOCOLS)
-            self.mistakes.add(place, fault or f"{shown(protocol)} is no protocol: {hint}")
-            return None
-        known = driver_settings(protocol)
-        for key in own.keys() - known:
-            every = sorted((known | set(DeviceSection.model_fields)) - {"protocol"})
-            self.mistakes.add((*path, key), unknown(key, f"a {protocol} device", every))
-        return driver_of(
-            protocol, {k: v for k, v in own.items() if k in known}, path, self.mistakes
-        )
-
-    def _defaults(self, raw: Mapping[str, Any], path: Path, outer: TagDefaults) -> TagDefaults:
-        found = raw.get("defaults")
-        if not isinstance(found, dict):
-            return outer
-        inner = section(TagDefaults, found, (*path, "defaults"), self.mistakes, "defaults")
-        return outer if inner is None else inherit(outer, inner)
-
-    def _name(self, text: str, path: Path) -> str:
-        try:
-            return parsers.name(text)
-        except ConfigError as error:
-            self.mistakes.add(path, str(error))
-            return text
 
     def _check_ports(self, lines: list[LineConfig], raw_lines: object) -> None:
         ports: dict[object, str] = {}
@@ -311,14 +261,13 @@ class Builder:
                     places = [(port.host, port.port), *port.reach.others]
             others = [ports.setdefault(place, line.name) for place in places]
             if other := next((one for one in others if one != line.name), ""):
-                self.mistakes.add(
-                    ("lines", line.name, "port"),
+                self.mistakes.at("lines", line.name, "port").add(
                     f"line {other} has this port already: one port is one line, "
-                    "with all its devices",
+                    "with all its devices"
                 )
 
-    def _file(self, name: FilePath | None, path: Path) -> FilePath | None:
-        return existing_file(name, self.folder, path, self.mistakes)
+    def _file(self, name: FilePath | None, *setting: str) -> FilePath | None:
+        return existing_file(name, self.folder, self.mistakes.at(*setting))
 
     def _written(self, name: FilePath) -> FilePath:
         """Returns the path of a file that the gateway writes."""
@@ -329,6 +278,55 @@ class Builder:
         if name is None and self.state_folder is not None:
             name = usual
         return None if name is None else self._written(name)
+
+
+def _check_identity(
+    names: Collection[str], driver: AnyDriver, tags: Sequence[Tag], mistakes: Mistakes
+) -> None:
+    if not names:  # as of most devices
+        return
+    own = driver.identity_names if isinstance(driver, Identifies) else ()
+    areas = driver.areas
+    read = [tag for tag in tags if replace(tag.origin, not_real=None) == READ and tag.polled]
+    known = {tag.name for tag in read if areas[tag.span.area].readable}
+    for name in set(names) - known - set(own):
+        also = f", or {one_of(sorted(own))}" if own else ""
+        mistakes.at(name).add(
+            f"a {driver.protocol} device does not tell {name}: name a tag of it that is read, "
+            f"such as one with its serial number{also}"
+        )
+
+
+def _driver(protocol: object, own: dict[str, Any], mistakes: Mistakes) -> AnyDriver | None:
+    if protocol is None:
+        mistakes.add(f"missing: a device needs its protocol: {protocols()}", "protocol")
+        return None
+    if not isinstance(protocol, str) or protocol not in PROTOCOLS:
+        fault = fault_of(str(protocol))
+        hint = meant(str(protocol), PROTOCOLS)
+        mistakes.add(fault or f"{shown(protocol)} is no protocol: {hint}", "protocol")
+        return None
+    known = driver_settings(protocol)
+    for key in own.keys() - known:
+        every = sorted((known | set(DeviceSection.model_fields)) - {"protocol"})
+        mistakes.add(unknown(key, f"a {protocol} device", every), key)
+    return driver_of(protocol, {k: v for k, v in own.items() if k in known}, mistakes)
+
+
+def _defaults(raw: Mapping[str, Any], mistakes: Mistakes, outer: TagDefaults) -> TagDefaults:
+    found = raw.get("defaults")
+    if not isinstance(found, dict):
+        return outer
+    inner = section(TagDefaults, found, mistakes.at("defaults"), "defaults")
+    return outer if inner is None else inherit(outer, inner)
+
+
+def _name(text: str, mistakes: Mistakes) -> str:
+    try:
+        return parsers.name(text)
+    except ConfigError as error:
+        mistakes.add(str(error))
+        return text
 
 
 def _devices_of(raw: object) -> object:

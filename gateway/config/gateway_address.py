@@ -57,7 +57,7 @@ def address(path: Path) -> GatewayAddress | None:
         zenoh.check()
     except ValueError:  # and `ConfigError`, which is one
         return None
-    zenoh = with_files(zenoh, path.parent, mistakes)
+    zenoh = with_files(zenoh, path.parent, mistakes.at("zenoh"))
     if len(mistakes) or ("standby_alone" in gateway and "standby" not in gateway):
         return None
     return GatewayAddress(

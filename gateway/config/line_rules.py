@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from gateway.config.messages import Mistakes, Path
+from gateway.config.messages import Mistakes
 from gateway.config.port_rules import (
     check_connection,
     check_datagrams,
@@ -34,49 +34,44 @@ _TEXT = 20  # characters, more than the modem's own text NO CARRIER with its lin
 _LATE = 0.05  # seconds by which an adapter may delay a part of it
 
 
-def check_line(
-    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
-) -> None:
+def check_line(line: LineSection, devices: Sequence[DeviceSettings], mistakes: Mistakes) -> None:
     """Notes every conflict between the line and its devices."""
-    _check_unsolicited(devices, path, mistakes)
-    _check_stations(devices, path, mistakes)
+    _check_unsolicited(devices, mistakes)
+    _check_stations(devices, mistakes)
     if line.format is not None:
-        _check_format(line.format, devices, (*path, "format"), mistakes)
+        _check_format(line.format, devices, mistakes.at("format"))
     if line.request_gap is not None and not line.serve:
         text = "request_gap is a setting of served lines: this line has no `serve: true`"
-        mistakes.add((*path, "request_gap"), text)
+        mistakes.add(text, "request_gap")
     if line.listen_only:
-        _check_listening(line, devices, path, mistakes)
-    check_connection(line, devices, path, mistakes)
-    check_tls(line, devices, path, mistakes)
-    check_datagrams(line, devices, path, mistakes)
-    check_heartbeat(line, devices, path, mistakes)
+        _check_listening(line, devices, mistakes)
+    check_connection(line, devices, mistakes)
+    check_tls(line, devices, mistakes)
+    check_datagrams(line, devices, mistakes)
+    check_heartbeat(line, devices, mistakes)
     for device in devices:
-        driver, place = device.driver, (*path, "devices", device.name)
+        driver, own = device.driver, mistakes.at("devices", device.name)
         if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):
-            mistakes.add(
-                (*path, "port"),
-                f"{device.name} cannot be simulated: there is no station for {driver.protocol}",
+            mistakes.at("port").add(
+                f"{device.name} cannot be simulated: there is no station for {driver.protocol}"
             )
         if line.echo and isinstance(driver, EchoConflict) and driver.echo_conflict is not None:
             setting, reason = driver.echo_conflict
-            mistakes.add((*place, setting), f"the line has `echo: true`, and {reason}")
+            own.add(f"the line has `echo: true`, and {reason}", setting)
         if driver.traits.over_network:
-            _check_network(line, devices, device, place, mistakes)
+            _check_network(line, devices, device, own)
 
 
-def origin_of(line: LineSection, path: Path, mistakes: Mistakes) -> NotReal | None:
+def origin_of(line: LineSection, mistakes: Mistakes) -> NotReal | None:
     """Returns what stands behind the port instead of devices; None: real devices do."""
     simulator = isinstance(line.port, SimulatorAddress)
     if line.origin is not None and (simulator or line.serve):
         why = "port: simulator says it already" if simulator else "a served line reads no PLC"
-        mistakes.add((*path, "origin"), f"{why}: remove origin")
+        mistakes.add(f"{why}: remove origin", "origin")
     return "simulated" if simulator else line.origin
 
 
-def _check_format(
-    given: str, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
-) -> None:
+def _check_format(given: str, devices: Sequence[DeviceSettings], mistakes: Mistakes) -> None:
     """Refuses a format that the protocol of a device does not have, once for all devices."""
     binary = [device for device in devices if device.driver.traits.binary]
     others = [
@@ -87,9 +82,8 @@ def _check_format(
     if binary and given[0] == "7":
         first = binary[0]
         mistakes.add(
-            path,
             f"{given} has 7 data bits, but {_named(binary)} {first.driver.protocol}, which needs "
-            f"8, such as 8{given[1:]}",
+            f"8, such as 8{given[1:]}"
         )
     if not others:
         return
@@ -100,9 +94,8 @@ def _check_format(
         advice = f"{name} ({rtu}) needs 8 data bits: use two ports, or {protocol} devices in "
         advice += "their Modbus mode"
     mistakes.add(
-        path,
         f"{given}, but {_named(others)} {protocol}, which is {traits.format} by its "
-        f"manual or its own `format`. {advice}",
+        f"manual or its own `format`. {advice}"
     )
 
 
@@ -111,24 +104,23 @@ def _named(devices: Sequence[DeviceSettings]) -> str:
     return f"{first} and {more} more speak" if more else f"{first} speaks"
 
 
-def _check_stations(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
+def _check_stations(devices: Sequence[DeviceSettings], mistakes: Mistakes) -> None:
     stations: dict[tuple[str, int], str] = {}
     for device in devices:
         if device.driver.traits.alone and len(devices) > 1:
             text = f"{device.driver.protocol} has no station numbers: give it a line of its own"
-            mistakes.add((*path, "devices", device.name, "protocol"), text)
+            mistakes.add(text, "devices", device.name, "protocol")
         if not device.driver.traits.numbered:
             continue
         protocol, number = device.driver.protocol, device.driver.station
         other = stations.setdefault((protocol, number), device.name)
         if other != device.name:
-            mistakes.add(
-                (*path, "devices", device.name, "station"),
-                f"{other} on this line is station {number} already: both would answer at once",
+            mistakes.at("devices", device.name, "station").add(
+                f"{other} on this line is station {number} already: both would answer at once"
             )
 
 
-def _check_unsolicited(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
+def _check_unsolicited(devices: Sequence[DeviceSettings], mistakes: Mistakes) -> None:
     """An unsolicited frame does not say which device sent it."""
     senders = [
         device.name
@@ -136,45 +128,41 @@ def _check_unsolicited(devices: Sequence[DeviceSettings], path: Path, mistakes: 
         if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
     ]
     for name in senders[1:]:
-        mistakes.add(
-            (*path, "devices", name, "listen"),
+        mistakes.at("devices", name, "listen").add(
             f"{senders[0]} on this line sends unsolicited frames already, and a frame does not "
             "say which device sent it: give this device a line of its own, or write both as one "
-            "device",
+            "device"
         )
 
 
 def _check_listening(
-    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+    line: LineSection, devices: Sequence[DeviceSettings], mistakes: Mistakes
 ) -> None:
     """Another master's requests and replies must be known, and found by one reader."""
     if line.serve:
-        mistakes.add(
-            (*path, "listen_only"),
-            "a line with `serve: true` answers its master, so it cannot only listen: remove one",
+        mistakes.at("listen_only").add(
+            "a line with `serve: true` answers its master, so it cannot only listen: remove one"
         )
     if isinstance(line.port, SimulatorAddress):
-        mistakes.add((*path, "port"), "listen_only: the simulator has no other master to listen to")
+        mistakes.add("listen_only: the simulator has no other master to listen to", "port")
     framings = dict[object, str]()
     for device in devices:
-        driver, place = device.driver, (*path, "devices", device.name, "protocol")
+        driver, own = device.driver, mistakes.at("devices", device.name)
         if not isinstance(driver, Listenable) or driver.traits.over_network:
-            mistakes.add(
-                place,
+            own.at("protocol").add(
                 f"the line has `listen_only: true`, and values of {driver.protocol} cannot be "
-                "learned from another master: remove listen_only, or this device",
+                "learned from another master: remove listen_only, or this device"
             )
             continue
         if device.identity:
             text = "a line with `listen_only: true` asks no device which one it is"
-            mistakes.add((*place[:-1], "identity"), text)
+            own.add(text, "identity")
         other = framings.setdefault(driver.framing, device.name)
         first = next(iter(framings.values()))
         if other != first:
-            mistakes.add(
-                place,
+            own.at("protocol").add(
                 f"the line has `listen_only: true`, and {first} has other frames: all devices of "
-                "such a line have one protocol and one format",
+                "such a line have one protocol and one format"
             )
 
 
@@ -182,63 +170,59 @@ def _check_network(
     line: LineSection,
     devices: Sequence[DeviceSettings],
     device: DeviceSettings,
-    path: Path,
     mistakes: Mistakes,
 ) -> None:
     protocol = device.driver.protocol
     if not isinstance(line.port, TcpAddress | UdpAddress | ListenAddress | SimulatorAddress):
-        mistakes.add(
-            (*path, "protocol"),
+        mistakes.at("protocol").add(
             f"{protocol} needs a port tcp://host:port, udp://host:port or listen://host:port: it "
-            "does not run on a serial line",
+            "does not run on a serial line"
         )
     serial = [other for other in devices if not other.driver.traits.over_network]
     if serial:
-        mistakes.add(
-            (*path, "protocol"),
+        mistakes.at("protocol").add(
             f"{protocol} cannot share a line with {serial[0].name}, "
-            f"which speaks {serial[0].driver.protocol}: give it a line of its own",
+            f"which speaks {serial[0].driver.protocol}: give it a line of its own"
         )
 
 
 def modem_of(
-    line: LineSection, raw: object, wire: WireTiming, path: Path, mistakes: Mistakes
+    line: LineSection, raw: object, wire: WireTiming, mistakes: Mistakes
 ) -> ModemSettings | None:
     """Returns the modem of a line; None: it has none. `raw`: the section, also with mistakes."""
-    found, place = line.modem, (*path, "modem")
+    found, own = line.modem, mistakes.at("modem")
     if not isinstance(line.port, ModemAddress):
         if found is not None:
-            mistakes.add(place, "the port has no modem: write it as modem:/dev/ttyS0")
+            own.add("the port has no modem: write it as modem:/dev/ttyS0")
         return None
     if line.listen_only:
-        mistakes.add((*path, "listen_only"), "a modem has a call only if it dials or answers")
+        mistakes.add("a modem has a call only if it dials or answers", "listen_only")
     number = None if found is None else found.number
     named = isinstance(raw, dict) and "number" in raw
     if not (named or line.serve):
-        mistakes.add(
-            place,
+        own.add(
             'missing: write the number that it dials, such as modem: {number: "0,26204393"}; a '
-            "line that answers calls has `serve: true`",
+            "line that answers calls has `serve: true`"
         )
     elif number is not None and line.serve:
         text = "a line with `serve: true` answers calls, it never dials: remove the number"
-        mistakes.add((*place, "number"), text)
+        own.add(text, "number")
     found = found or ModemSection()
     usual = ANSWERS_IDLE if line.serve else DIALS_IDLE
-    own = {
+    settings = {
         **dict(found),
         "number": number or "",
         "idle": usual if found.idle is None else found.idle,
         "hold": _TEXT * wire.character + _LATE,
     }
-    return ModemSettings(**own)
+    return ModemSettings(**settings)
 
 
 def line_wire(
-    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+    line: LineSection, devices: Sequence[DeviceSettings], mistakes: Mistakes
 ) -> tuple[SerialSettings, WireTiming]:
     """Returns speed and format: those of the file, or the defaults of all protocols of the line."""
-    rs485 = direction(line, path, mistakes)
+    rs485 = direction(line, mistakes)
     traits = {device.driver.protocol: device.driver.traits for device in devices}
     rates = {name: usual.baudrate for name, usual in traits.items()}
     formats = {name: usual.format for name, usual in traits.items()}
@@ -250,9 +234,7 @@ def line_wire(
     ):
         if given is None and len(set(usual.values())) > 1:
             defaults = ", ".join(f"{name} {value}" for name, value in usual.items())
-            mistakes.add(
-                (*path, setting), f"missing: the devices of this line differ in it ({defaults})"
-            )
+            mistakes.add(f"missing: the devices of this line differ in it ({defaults})", setting)
     baudrate = line.baudrate or next(filter(None, rates.values()), 9600)
     format_ = line.format or next(iter(formats.values()), "8N1")
     serial = SerialSettings(baudrate, format_, rs485)

@@ -174,9 +174,8 @@ def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
             if not mistakes.has(one.setting) and any(
                 files.are_same(FilePath(f"{one.file}{tail}"), other) for tail in one.tails
             ):
-                mistakes.add(
-                    one.setting,
-                    f"{one.file.name} is {what}: name another file, such as {one.example}",
+                mistakes.at(*one.setting).add(
+                    f"{one.file.name} is {what}: name another file, such as {one.example}"
                 )
         what = f"a file of {'.'.join(map(str, one.setting))}"
         earlier += [(what, FilePath(f"{one.file}{tail}")) for tail in one.tails]

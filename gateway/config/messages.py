@@ -66,15 +66,23 @@ class Mistake(NamedTuple):
 
 @dataclass(slots=True)
 class Mistakes:
-    """The mistakes found so far in one file. `elsewhere`: it is the file of another machine, which
-    has the files that it names."""
+    """The mistakes found so far in one file, to be noted below `path`. `elsewhere`: it is the file
+    of another machine, which has the files that it names."""
 
     places: Places
     elsewhere: bool = False
+    path: Path = ()
     _found: list[Mistake] = field(default_factory=list)
     _others: list["Mistakes"] = field(default_factory=list)
 
-    def add(self, path: Path, what: str) -> None:
+    def at(self, *place: str | int) -> "Mistakes":
+        """Returns the same mistakes; those noted there are below the place."""
+        path = (*self.path, *place)
+        return Mistakes(self.places, self.elsewhere, path, self._found, self._others)
+
+    def add(self, what: str, *place: str | int) -> None:
+        """Notes a mistake at the path, or at a place below it."""
+        path = (*self.path, *place)
         mistake = Mistake(self.places.line(path), path, what)
         if mistake not in self._found[-20:]:
             self._found.append(mistake)

@@ -146,8 +146,8 @@ def _tag(device: str, driver: AnyDriver, span: Span) -> Tag:
         }
     )
     mistakes = Mistakes(OptionPlaces())
-    source = TagSource(device, f"@{name.replace(':', '-')}", section, TagDefaults(), ())
-    tag = build_tag(source, driver, mistakes)
+    source = TagSource(device, f"@{name.replace(':', '-')}", section, TagDefaults(), mistakes)
+    tag = build_tag(source, driver)
     if tag is None or tag.write is None or len(mistakes):
         raise BadValue("; ".join(mistakes.sentences()) or f"{name} cannot be written")
     return tag

@@ -53,7 +53,7 @@ class Place:
 
     def existing(self, name: FilePath | None, *setting: str) -> FilePath | None:
         """Returns the path of a file that must exist."""
-        return existing_file(name, self.folder, setting, self.mistakes)
+        return existing_file(name, self.folder, self.mistakes.at(*setting))
 
 
 def _same(settings: Any, _place: Place) -> Any:

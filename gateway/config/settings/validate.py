@@ -22,7 +22,7 @@ S = TypeVar("S", bound=Section)
 _BRANCHES = ("flag", "rule")
 
 
-def section(kind: type[S], raw: object, path: Path, mistakes: Mistakes, called: str) -> S | None:
+def section(kind: type[S], raw: object, mistakes: Mistakes, called: str) -> S | None:
     """Returns the section without its mistakes; None if that is impossible."""
     try:
         return kind.model_validate(raw)
@@ -30,7 +30,7 @@ def section(kind: type[S], raw: object, path: Path, mistakes: Mistakes, called: 
         rest = raw
         for detail in error.errors():
             place = tuple(chunk for chunk in detail["loc"] if chunk not in _BRANCHES)
-            mistakes.add((*path, *place), _sentence(detail, called, _known(kind, place[:-1])))
+            mistakes.add(_sentence(detail, called, _known(kind, place[:-1])), *place)
             rest = _without(rest, place)
     try:
         return kind.model_validate(rest)
@@ -49,13 +49,11 @@ def _without(raw: Any, place: Path) -> Any:
     return rest
 
 
-def driver_of(
-    protocol: str, settings: Mapping[str, Any], path: Path, mistakes: Mistakes
-) -> AnyDriver | None:
+def driver_of(protocol: str, settings: Mapping[str, Any], mistakes: Mistakes) -> AnyDriver | None:
     """Returns the driver with these settings; with mistakes, one with the correct settings."""
     before = len(mistakes)
     kind = PROTOCOLS[protocol].settings
-    values = plain_settings(kind, settings, path, mistakes)
+    values = plain_settings(kind, settings, mistakes)
     nested = any(dataclasses_in(kind))
     if nested and len(mistakes) > before:
         return None  # the rest cannot be checked without the part that is wrong
@@ -69,7 +67,7 @@ def driver_of(
             first = text.split(maxsplit=1)[0].rstrip(":,")
             if not place and first in values:
                 place, text = (first,), text.removeprefix(f"{first}: ")
-            mistakes.add((*path, *place), text)
+            mistakes.add(text, *place)
             values.pop(str(place[0]) if place else "station", None)
     if nested:
         return None
@@ -179,19 +177,17 @@ def protocols() -> str:
 _LEFT_OUT = object()
 
 
-def plain_settings(
-    kind: type[Any], raw: Mapping[str, Any], path: Path, mistakes: Mistakes
-) -> dict[str, Any]:
+def plain_settings(kind: type[Any], raw: Mapping[str, Any], mistakes: Mistakes) -> dict[str, Any]:
     """Returns the settings of a dataclass without mistakes, and notes those."""
     hints = get_type_hints(kind)
     known = [field.name for field in dataclasses.fields(kind) if field.init]
     found: dict[str, Any] = {}
     for name, value in raw.items():
         if name not in known:
-            owner = path[-1] if path else "the file"
-            mistakes.add((*path, name), f"no setting of {owner}: {meant(name, known)}")
+            owner = mistakes.path[-1] if mistakes.path else "the file"
+            mistakes.add(f"no setting of {owner}: {meant(name, known)}", name)
             continue
-        plain = _plain(hints[name], value, (*path, name), mistakes)
+        plain = _plain(hints[name], value, mistakes.at(name))
         if plain is not _LEFT_OUT:
             found[name] = plain
     return found
@@ -212,25 +208,24 @@ def dataclasses_in(kind: type[Any]) -> Iterator[type[Any]]:
                 yield from dataclasses_in(part)
 
 
-def _plain(hint: Any, value: Any, path: Path, mistakes: Mistakes) -> Any:
+def _plain(hint: Any, value: Any, mistakes: Mistakes) -> Any:
     if is_duration(hint):
         try:
             return value if value is None else parsers.duration(value)
         except ConfigError as error:
-            mistakes.add(path, str(error))
+            mistakes.add(str(error))
             return _LEFT_OUT
     if not isinstance(value, dict):
-        return _number(hint, value, path)
+        return _number(hint, value, mistakes.path)
     inner = _dataclass_in(hint)
     if inner is None:
         return value
     if _by_name(hint):
-        each = {name: (one, (*path, name)) for name, one in value.items()}
         return {
-            name: plain_settings(inner, one, place, mistakes) if isinstance(one, dict) else one
-            for name, (one, place) in each.items()
+            name: plain_settings(inner, one, mistakes.at(name)) if isinstance(one, dict) else one
+            for name, one in value.items()
         }
-    return plain_settings(inner, value, path, mistakes)
+    return plain_settings(inner, value, mistakes)
 
 
 def _number(hint: Any, value: Any, path: Path) -> Any:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path as FilePath
 
-from gateway.config.messages import Mistakes, Path
+from gateway.config.messages import Mistakes
 from gateway.errors import ConfigError
 from gateway.files import is_file
 from gateway.transport.port import TlsConfig as TlsConfig
@@ -47,24 +47,24 @@ class ZenohConfig:
 def with_files(found: ZenohConfig, folder: FilePath, mistakes: Mistakes) -> ZenohConfig:
     """Returns the session with its paths below `folder`; notes each file that is not there."""
 
-    def file(name: FilePath | None, *place: str) -> FilePath | None:
-        return existing_file(name, folder, ("zenoh", *place), mistakes)
+    def file(setting: str) -> FilePath | None:
+        return existing_file(getattr(found, setting), folder, mistakes.at(setting))
 
     tls = found.tls
     return replace(
         found,
-        config_file=file(found.config_file, "config_file"),
-        tls=None if tls is None else tls_files(tls, folder, ("zenoh", "tls"), mistakes),
-        password_file=file(found.password_file, "password_file"),
-        users_file=file(found.users_file, "users_file"),
+        config_file=file("config_file"),
+        tls=None if tls is None else tls_files(tls, folder, mistakes.at("tls")),
+        password_file=file("password_file"),
+        users_file=file("users_file"),
     )
 
 
-def tls_files(found: TlsConfig, folder: FilePath, path: Path, mistakes: Mistakes) -> TlsConfig:
+def tls_files(found: TlsConfig, folder: FilePath, mistakes: Mistakes) -> TlsConfig:
     """Returns the certificates with their paths below `folder`; notes files that are not there."""
 
     def file(name: str) -> FilePath | None:
-        return existing_file(getattr(found, name), folder, (*path, name), mistakes)
+        return existing_file(getattr(found, name), folder, mistakes.at(name))
 
     return replace(
         found,
@@ -75,13 +75,11 @@ def tls_files(found: TlsConfig, folder: FilePath, path: Path, mistakes: Mistakes
     )
 
 
-def existing_file(
-    name: FilePath | None, folder: FilePath, path: Path, mistakes: Mistakes
-) -> FilePath | None:
+def existing_file(name: FilePath | None, folder: FilePath, mistakes: Mistakes) -> FilePath | None:
     """Returns the path of a file that must exist, if this is its machine."""
     if name is None:
         return None
     file = folder / name
     if not (mistakes.elsewhere or is_file(file)):
-        mistakes.add(path, f"there is no file {file}")
+        mistakes.add(f"there is no file {file}")
     return file

@@ -57,7 +57,6 @@ class SheetPlaces:
 class SheetTags:
     """Reads the sheets of a file, each once. `tags` builds the tags of the file itself."""
 
-    mistakes: Mistakes
     folder: FilePath
     used: list[SheetUse] = field(default_factory=list)
     recorded: Path | None = None  # as in `DeviceTags`
@@ -67,15 +66,15 @@ class SheetTags:
         self,
         device: str,
         file: FilePath,
-        path: Path,
+        to: Mistakes,
         defaults: TagDefaults,
         driver: Addressing | None,
         taken: Collection[str],
         *,
         not_real: NotReal | None = None,
     ) -> tuple[Tag, ...]:
-        """Returns the tags of a device in a sheet. `path`: of the setting that names the sheet."""
-        grid = self._grid(self.folder / file, path)
+        """Returns the tags of a device in a sheet. `to`: of the setting that names the sheet."""
+        grid = self._grid(self.folder / file, to)
         if grid is None:
             return ()
         try:
@@ -83,28 +82,28 @@ class SheetTags:
                 grid = link_table.of_station(grid, driver.station, native(driver))
             sheet = read_sheet(grid, device, other_settings(), parsed)
         except ConfigError as error:
-            self.mistakes.add(path, f"{file}: {error}")
+            to.add(f"{file}: {error}")
             return ()
         mistakes = _mistakes(file, sheet, grid)
         for name in sheet.tags.keys() & taken:
-            mistakes.add((name, "name"), f"{name} is in `tags` of {device} already")
-        builder = DeviceTags(mistakes)
-        tags = builder.build(device, sheet.tags, (), defaults, driver, not_real=not_real)
+            mistakes.add(f"{name} is in `tags` of {device} already", name, "name")
+        builder = DeviceTags()
+        tags = builder.build(device, sheet.tags, mistakes, defaults, driver, not_real=not_real)
         if builder.recorded is not None and self.recorded is None:
-            self.recorded = path
-        self.mistakes.include(mistakes)
+            self.recorded = to.path
+        to.include(mistakes)
         self.used.append(SheetUse(device, self.folder / file, sheet.tags, tuple(sheet.notes)))
         return tags
 
-    def _grid(self, file: FilePath, path: Path) -> Grid | None:
+    def _grid(self, file: FilePath, to: Mistakes) -> Grid | None:
         if file not in self.grids:
             self.grids[file] = None
             try:
                 self.grids[file] = read_grid(files.read(file))
             except ConfigError as error:
-                self.mistakes.add(path, f"{file.name}: {error}")
+                to.add(f"{file.name}: {error}")
             except OSError as error:
-                self.mistakes.add(path, f"{file} cannot be read: {error.strerror}")
+                to.add(f"{file} cannot be read: {error.strerror}")
         return self.grids[file]
 
 
@@ -134,7 +133,7 @@ def preview(
         )
     sheet = read_sheet(grid, device, other_settings(), parsed)
     mistakes = _mistakes(file, sheet, grid)
-    DeviceTags(mistakes).build(device, sheet.tags, (), TagDefaults(), None)
+    DeviceTags().build(device, sheet.tags, mistakes, TagDefaults(), None)
     mistakes.raise_all()
     return sheet.tags, sheet.notes
 

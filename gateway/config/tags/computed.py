@@ -45,15 +45,13 @@ class _Names:
         raise ConfigError(f"{name} is no tag of {source.device}: {hint}")
 
 
-def with_computed(
-    lines: list[LineConfig], sources: list[TagSource], mistakes: Mistakes
-) -> list[LineConfig]:
+def with_computed(lines: list[LineConfig], sources: list[TagSource]) -> list[LineConfig]:
     """Adds the computed tags to their devices."""
     if not sources:
         return lines
     known = {tag.key: tag for line in lines for device in line.devices for tag in device.tags}
     names = _Names(known, {source.key: source for source in sources})
-    maker = _Maker(names, mistakes, {})
+    maker = _Maker(names, {})
     found = [tag for source in sources if (tag := maker.make(source, ())) is not None]
     return [
         replace(line, devices=tuple(_with_tags(device, found) for device in line.devices))
@@ -69,7 +67,6 @@ def _with_tags(device: DeviceSettings, tags: list[Tag]) -> DeviceSettings:
 @dataclass(slots=True)
 class _Maker:
     names: _Names
-    mistakes: Mistakes
     made: dict[str, Tag | None]
 
     def make(self, source: TagSource, below: tuple[str, ...]) -> Tag | None:
@@ -79,7 +76,7 @@ class _Maker:
                 self.made[source.key] = self._make(source, below)
             except ConfigError as error:
                 self.made[source.key] = None
-                self.mistakes.add((*source.path, "computed"), str(error))
+                source.mistakes.add(str(error), "computed")
         return self.made[source.key]
 
     def _make(self, source: TagSource, below: tuple[str, ...]) -> Tag | None:
@@ -114,7 +111,7 @@ class _Maker:
         whole = parsed.whole and not any(one.value_type.startswith("float") for one in inputs)
         kind = ValueType(Kind.INT64 if whole else Kind.FLOAT64)
         facts = Facts(kind=kind, text="", settings=settings, whole=whole)
-        check(source, facts, self.mistakes)
+        check(source, facts)
         return Tag(
             device=source.device,
             name=source.name,
@@ -140,8 +137,7 @@ def check_totals(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
             for tag in device.tags:
                 if isinstance(tag.origin.kept, CounterRule):
                     place = ("lines", line.name, "devices", device.name, "tags", tag.name)
-                    mistakes.add(
-                        (*place, "counter"),
+                    mistakes.at(*place, "counter").add(
                         "a total is kept by one gateway, and this one has a standby: remove "
-                        "counter, and count in the PLC",
+                        "counter, and count in the PLC"
                     )

@@ -27,7 +27,6 @@ _Alike = dict[str, Tag]
 class DeviceTags:
     """Builds the tags of all devices of a file, and notes every mistake."""
 
-    mistakes: Mistakes
     recorded: Path | None = None  # the first tag with `history: true`
     computed: list[TagSource] = field(default_factory=list)
     _names: dict[str, str] = field(default_factory=dict)  # correct ones, as typed
@@ -37,7 +36,7 @@ class DeviceTags:
         self,
         device: str,
         raw_tags: object,
-        path: Path,
+        mistakes: Mistakes,
         defaults: TagDefaults,
         driver: Addressing | None,
         *,
@@ -52,68 +51,68 @@ class DeviceTags:
         seen: set[str] = set()
         # Once for all tags: the search for its methods takes a tenth of the time of a tag.
         fields = driver if isinstance(driver, TypedFields) else None
-        rows = with_bits(dict(mapping(raw_tags)), path, driver, self.mistakes)
+        rows = with_bits(dict(mapping(raw_tags)), driver, mistakes)
         for raw_name, raw, place in rows:
-            name = self._names.get(raw_name) or self._name(raw_name, place)
+            name = self._names.get(raw_name) or self._name(raw_name, mistakes.at(*place))
             if name in seen:
-                self.mistakes.add(place, f"{name} is there twice, typed in two ways")
+                mistakes.add(f"{name} is there twice, typed in two ways", *place)
             seen.add(name)
             if isinstance(raw, dict) and "computed" in raw:
-                self._note_computed(device, name, raw, place, defaults)
+                self._note_computed(device, name, raw, defaults, mistakes.at(*place))
                 continue
             text = repr(raw)
             known = alike.get(text)
             if known is not None:
                 tag: Tag | None = known.copy(device, name)
             else:
-                before = len(self.mistakes)
-                tag = self._tag(device, name, raw, place, defaults, driver, fields)
+                before, own = len(mistakes), mistakes.at(*place)
+                tag = _tag(device, name, raw, own, defaults, driver, fields)
                 tag = None if tag is None else tag.with_origin(not_real)
-                if tag is not None and len(self.mistakes) == before:
+                if tag is not None and len(mistakes) == before:
                     alike[text] = tag
             if tag is not None:
                 if tag.publishing.history and self.recorded is None:
-                    self.recorded = place
+                    self.recorded = (*mistakes.path, *place)
                 tags.append(tag)
         return tuple(tags)
 
-    def _tag(
-        self,
-        device: str,
-        name: str,
-        raw: object,
-        place: Path,
-        defaults: TagDefaults,
-        driver: Addressing | None,
-        fields: TypedFields | None,
-    ) -> Tag | None:
-        own = section(TagSection, raw, place, self.mistakes, "a tag")
-        if own is None or driver is None:
-            return None
-        unknown_type = isinstance(raw, dict) and "type" in raw and own.type is None
-        source = TagSource(device, name, own, defaults, place, type_unknown=unknown_type)
-        if fields is not None:
-            return field_tag(source, driver, fields, self.mistakes)
-        return build_tag(source, driver, self.mistakes)
-
     def _note_computed(
-        self, device: str, name: str, raw: object, place: Path, defaults: TagDefaults
+        self, device: str, name: str, raw: object, defaults: TagDefaults, mistakes: Mistakes
     ) -> None:
-        own = section(ComputedSection, raw, place, self.mistakes, "a computed tag")
+        own = section(ComputedSection, raw, mistakes, "a computed tag")
         if own is None:
             return
-        self.computed.append(TagSource(device, name, own, defaults, place))
+        self.computed.append(TagSource(device, name, own, defaults, mistakes))
         if inherit(defaults, own).history and self.recorded is None:
-            self.recorded = place
+            self.recorded = mistakes.path
 
-    def _name(self, text: str, path: Path) -> str:
+    def _name(self, text: str, mistakes: Mistakes) -> str:
         try:
             name = parsers.tag_name(text)
         except ConfigError as error:
-            self.mistakes.add(path, str(error))
+            mistakes.add(str(error))
             return text
         self._names[text] = name
         return name
+
+
+def _tag(
+    device: str,
+    name: str,
+    raw: object,
+    mistakes: Mistakes,
+    defaults: TagDefaults,
+    driver: Addressing | None,
+    fields: TypedFields | None,
+) -> Tag | None:
+    own = section(TagSection, raw, mistakes, "a tag")
+    if own is None or driver is None:
+        return None
+    unknown_type = isinstance(raw, dict) and "type" in raw and own.type is None
+    source = TagSource(device, name, own, defaults, mistakes, type_unknown=unknown_type)
+    if fields is not None:
+        return field_tag(source, driver, fields)
+    return build_tag(source, driver)
 
 
 def mapping(raw: object) -> list[tuple[str, object]]:
@@ -121,12 +120,10 @@ def mapping(raw: object) -> list[tuple[str, object]]:
     return list(raw.items()) if isinstance(raw, dict) else []
 
 
-def field_tag(
-    source: TagSource, driver: Addressing, fields: TypedFields, mistakes: Mistakes
-) -> Tag | None:
+def field_tag(source: TagSource, driver: Addressing, fields: TypedFields) -> Tag | None:
     """Returns the tag, or None after its mistakes were noted. `fields` is the driver as well."""
-    before = len(mistakes)
-    address = address_of(source, driver, mistakes)
+    before = len(source.mistakes)
+    address = address_of(source, driver)
     if address is None:
         return None
     settings = inherit(source.inherited, source.own)
@@ -138,15 +135,14 @@ def field_tag(
         spell=lambda: name,
         station=driver.station,
         field=field,
-        write=_write(source, settings, name, field, mistakes),
+        write=_write(source, settings, name, field),
     )
-    check(source, facts, mistakes)
-    if len(mistakes) > before:
+    check(source, facts)
+    if len(source.mistakes) > before:
         return None
     return made(
         source,
         facts,
-        mistakes,
         address=address,
         span=Span(address.area, address.number, 1),
         unit_kind=Unit.WORD,
@@ -155,9 +151,7 @@ def field_tag(
     )
 
 
-def _write(
-    source: TagSource, settings: Any, name: str, field: TypedField, mistakes: Mistakes
-) -> WriteRule | None:
+def _write(source: TagSource, settings: Any, name: str, field: TypedField) -> WriteRule | None:
     if settings.write is False:
         return None
     if field.writable:
@@ -165,5 +159,5 @@ def _write(
     if source.sets("write"):
         problem = f"{name} cannot be written: the device has no frame for it"
         hint = f", {field.write_hint}" if field.write_hint else ""
-        mistakes.add((*source.path, "write"), problem + hint)
+        source.mistakes.add(problem + hint, "write")
     return None

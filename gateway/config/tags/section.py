@@ -4,7 +4,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import create_model
 
-from gateway.config.messages import Path
+from gateway.config.messages import Mistakes
 from gateway.config.settings.session_model import Section
 from gateway.config.settings.setting_types import Interval, Text
 from gateway.config.tags.registry import FEATURES
@@ -51,7 +51,7 @@ class TagSource(NamedTuple):
     name: str
     own: Any  # a `TagSection`
     inherited: Any  # `TagDefaults`
-    path: Path
+    mistakes: Mistakes  # at its place in the file
     type_unknown: bool = False  # its `type` was a mistake: the fit cannot be checked
 
     @property

@@ -84,14 +84,15 @@ class ServedDevice:
     raw: Mapping[str, Any]
     sheets: Sequence[Mapping[str, Mapping[str, object]]]
     defaults: Any
-    path: Path
     mistakes: Mistakes
 
     def build(self, tags: Sequence[Tag]) -> tuple[Served, tuple[Tag, ...]]:
         """Returns the station, and its tags that have keys of their own: those without source."""
         for setting in _OF_MASTERS:
             if setting in self.settings.model_fields_set:
-                self._note((setting,), f"{setting} has no effect: a served device sends no request")
+                self.mistakes.at(setting).add(
+                    f"{setting} has no effect: a served device sends no request"
+                )
         accept = tuple(filter(None, map(self._accepted, range(len(self.settings.accept)))))
         stale_after = self.settings.stale_after
         served = Served(
@@ -101,51 +102,46 @@ class ServedDevice:
         self._check_overlaps(rows)
         return replace(served, rows=rows), tuple(row.tag for row in rows if row.source is None)
 
-    def _note(self, place: Path, what: str) -> None:
-        self.mistakes.add((*self.path, *place), what)
-
     def _accepted(self, number: int) -> Span | None:
         """Returns the addresses of one entry of `accept`; None for a mistake."""
         text = self.settings.accept[number]
-        place = ("accept", number)
+        own = self.mistakes.at("accept", number)
         first, dots, last = (part.strip() for part in text.partition(".."))
         try:
             begin = self.driver.address(first)
             end = self.driver.address(last) if dots else begin
         except ConfigError as error:
-            self._note(place, str(error))
+            own.add(str(error))
             return None
         area = self.driver.areas.get(begin.area)
         if begin.area != end.area or begin.number > end.number or area is None:
-            self._note(place, f"{text} is no range: write it as D100..D119, the lower one first")
+            own.add(f"{text} is no range: write it as D100..D119, the lower one first")
         elif begin.bit is not None or end.bit is not None:
-            self._note(place, f"{text}: a master writes whole words: leave out the bit")
+            own.add(f"{text}: a master writes whole words: leave out the bit")
         elif not area.writable:
-            self._note(place, f"{text}: a master cannot write {first}, it is read-only")
+            own.add(f"{text}: a master cannot write {first}, it is read-only")
         else:
             return Span(begin.area, begin.number, end.number - begin.number + 1)
         return None
 
     def _row(self, tag: Tag, served: Served) -> ServedTag:
         own = self._own(tag.name)
-        place = ("tags", tag.name)
+        mistakes = self.mistakes.at("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
         tag = self._without_reads(tag, own)
         hold_last = own.get("hold_last", self.defaults.hold_last) is True
         inside = [served.takes(*cell) for cell in cells_of(tag.span)]
         accepted = any(inside)
         if accepted and not all(inside):
-            self._note(place, f"{tag.text} is in `accept` only in part: it has {len(inside)} words")
+            mistakes.add(f"{tag.text} is in `accept` only in part: it has {len(inside)} words")
         for problem in _role_problems(
             own, source, accepted=accepted, written=tag.write is not None
         ):
-            self._note(place, problem)
+            mistakes.add(problem)
         if retain and (accepted or source is not None):
-            self._note(
-                (*place, "retain"), "retain keeps what clients write: it needs `write: true`"
-            )
+            mistakes.add("retain keeps what clients write: it needs `write: true`", "retain")
         if "every" in own:
-            self._note((*place, "every"), "every has no effect: the master decides when it asks")
+            mistakes.add("every has no effect: the master decides when it asks", "every")
         if accepted and own.get("publish") != "change" and tag.publishing.deadband is None:
             each = replace(tag.publishing, publish=Publish.ALWAYS, event=True, heartbeat=None)
             tag = replace(tag, publishing=each)
@@ -166,7 +162,7 @@ class ServedDevice:
         for setting in ("debounce", "counter", "range"):
             if own.get(setting):
                 text = f"{setting} is for values that the gateway reads: remove it here"
-                self._note(("tags", tag.name, setting), text)
+                self.mistakes.add(text, "tags", tag.name, setting)
         if tag.origin.kept is not None:
             tag = replace(tag, origin=tag.origin.inputs[0].origin)
         if tag.shaping.range is not None:
@@ -190,7 +186,7 @@ class ServedDevice:
                 for other in others:
                     if not row.accepted and _bits(row.tag) & _bits(other.tag):
                         text = f"{other.tag.name} of this device is at {row.tag.text} already"
-                        self._note(("tags", row.tag.name, "address"), text)
+                        self.mistakes.add(text, "tags", row.tag.name, "address")
                 others.append(row)
 
 
@@ -222,7 +218,7 @@ def _name(text: object) -> str:
         return str(text)
 
 
-def only_served(raw: Mapping[str, Any], path: Path, mistakes: Mistakes) -> None:
+def only_served(raw: Mapping[str, Any], mistakes: Mistakes) -> None:
     """Notes settings of served lines at a device of another line."""
     tags = raw.get("tags")
     rest = tags.items() if isinstance(tags, Mapping) else ()
@@ -232,7 +228,7 @@ def only_served(raw: Mapping[str, Any], path: Path, mistakes: Mistakes) -> None:
             places += [("tags", name, setting) for setting in _OF_TAGS if setting in own]
     for place in places:
         text = f"{place[-1]} is a setting of served lines: this line has no `serve: true`"
-        mistakes.add((*path, *place), text)
+        mistakes.add(text, *place)
 
 
 def until_the_next_call(device: DeviceSettings, line: Mapping[str, Any]) -> DeviceSettings:
@@ -249,29 +245,28 @@ def request_gap(line: LineSection, *, dials: bool) -> float | None:
 
 
 def check_served_line(
-    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+    line: LineSection, devices: Sequence[DeviceSettings], mistakes: Mistakes
 ) -> None:
     """Notes what cannot be served together."""
     if isinstance(line.port, SimulatorAddress):
-        mistakes.add((*path, "port"), "a served line needs a real port: its master is elsewhere")
+        mistakes.add("a served line needs a real port: its master is elsewhere", "port")
     first = devices[0] if devices else None
     for device in devices:
-        driver, place = device.driver, (*path, "devices", device.name)
+        driver, own = device.driver, mistakes.at("devices", device.name)
         if not can_serve(driver.protocol):
             known = one_of(served_protocols())
-            mistakes.add((*place, "protocol"), f"{driver.protocol} cannot be served: {known} can")
+            own.add(f"{driver.protocol} cannot be served: {known} can", "protocol")
         if driver.station == 0 and all(not area.readable for area in driver.areas.values()):
-            mistakes.add((*place, "station"), "station 0 is all stations: it never answers")
+            own.add("station 0 is all stations: it never answers", "station")
         if first is None or driver.protocol != first.driver.protocol:
-            mistakes.add(
-                (*place, "protocol"),
-                "all stations of a served line speak one protocol: give this device its own line",
+            own.at("protocol").add(
+                "all stations of a served line speak one protocol: give this device its own line"
             )
             continue
         for setting in common_settings(driver.protocol):
             if getattr(driver, setting) != getattr(first.driver, setting):
                 text = f"{first.name} on this line has {shown(getattr(first.driver, setting))}"
-                mistakes.add((*place, setting), f"{text}: all stations of a line have the same")
+                own.add(f"{text}: all stations of a line have the same", setting)
 
 
 def check_sources(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
@@ -280,16 +275,16 @@ def check_sources(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
     for path, row in _rows(lines):
         if row.source is None:
             continue
-        source, place = tags.get(row.source), (*path, "source")
+        source, own = tags.get(row.source), mistakes.at(*path, "source")
         if source is None:
             text = f"there is no tag {row.source}: write device/tag, a tag of this file"
-            mistakes.add(place, text)
+            own.add(text)
         elif source.layout.type.count != row.tag.layout.type.count:
             kinds = f"{row.source} is {source.layout.type}, and this is {row.tag.layout.type}"
-            mistakes.add(place, f"{kinds}: an array is shown as an array of the same length")
+            own.add(f"{kinds}: an array is shown as an array of the same length")
         elif sort_of(source) != sort_of(row.tag):
             kinds = f"{row.source} is {source.layout.type}, and this is {row.tag.layout.type}"
-            mistakes.add(place, f"{kinds}: a value is shown as bit, number or text, not as another")
+            own.add(f"{kinds}: a value is shown as bit, number or text, not as another")
 
 
 def sort_of(tag: Tag) -> str:
@@ -310,7 +305,7 @@ def check_retained(
         return
     for path, row in _rows(lines):
         if row.retain:
-            to.add((*path, "retain"), why)
+            to.add(why, *path, "retain")
 
 
 def _rows(lines: Sequence[LineConfig]) -> Iterator[tuple[Path, ServedTag]]:

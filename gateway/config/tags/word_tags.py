@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from gateway.config.messages import Mistakes, Path
+from gateway.config.messages import Mistakes
 from gateway.config.tags.features.feature import Facts, Problem
 from gateway.config.tags.features.layout import default_type, layout_of, type_misfit
 from gateway.config.tags.features.writing import check_bounds, needs_write, rule_of
@@ -20,24 +20,24 @@ from gateway.values import ValueType
 _SIZES = {Unit.BIT: "bits", Unit.WORD: "words", Unit.DWORD: "values of 32 bits"}
 
 
-def build_tag(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Tag | None:
+def build_tag(source: TagSource, driver: Addressing) -> Tag | None:
     """Returns the tag, or None after its mistakes were noted."""
-    before = len(mistakes)
-    address = address_of(source, driver, mistakes)
+    before = len(source.mistakes)
+    address = address_of(source, driver)
     if address is None:
         return None
     area = driver.areas.get(address.area)
     if area is None:  # a broadcast has no areas that are only readable
         problem = f"{source.own.address} is read-only, and station {driver.station} cannot be read"
-        mistakes.add((*source.path, "address"), problem)
+        source.mistakes.add(problem, "address")
         return None
     if source.type_unknown:
         return None
     settings = inherit(source.inherited, source.own)
-    kind = _type(source, settings, driver, address, mistakes)
+    kind = _type(source, settings, driver, address)
     units = 1 if address.bit is not None else kind.words // (2 if area.unit is Unit.DWORD else 1)
     span = Span(area.name, address.number, units)
-    write = _write(source, settings, driver, span, kind, mistakes)
+    write = _write(source, settings, driver, span, kind)
     facts = Facts(
         kind=kind,
         text=source.own.address,
@@ -49,14 +49,13 @@ def build_tag(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Tag 
         write=write,
     )
     for place, problem in _misfits(driver, span, facts):
-        mistakes.add((*source.path, place), problem)
-    check(source, facts, mistakes)
-    if len(mistakes) > before:
+        source.mistakes.add(problem, place)
+    check(source, facts)
+    if len(source.mistakes) > before:
         return None
     return made(
         source,
         facts,
-        mistakes,
         address=address,
         span=span,
         unit_kind=area.unit,
@@ -64,12 +63,12 @@ def build_tag(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Tag 
     )
 
 
-def check(source: TagSource, facts: Facts, mistakes: Mistakes) -> None:
+def check(source: TagSource, facts: Facts) -> None:
     """Notes the settings of the tag that do not fit it."""
     checks = _features(frozenset(source.own.model_fields_set)).checks
     for check in (needs_write, *checks):
         for place, problem in check(source.own, facts):
-            mistakes.add((*source.path, place), problem)
+            source.mistakes.add(problem, place)
 
 
 class _Used(NamedTuple):
@@ -105,7 +104,7 @@ def kept_by(source: TagSource, facts: Facts) -> Mapping[str, Any]:
     return found
 
 
-def made(source: TagSource, facts: Facts, mistakes: Mistakes, **place: Any) -> Tag:
+def made(source: TagSource, facts: Facts, **place: Any) -> Tag:
     """Returns the tag of checked settings. `place`: more arguments of `Tag`."""
     tag = Tag(
         device=source.device,
@@ -117,28 +116,22 @@ def made(source: TagSource, facts: Facts, mistakes: Mistakes, **place: Any) -> T
         **kept_by(source, facts),
     )
     for setting, problem in check_bounds(source.own, tag):
-        mistakes.add((*source.path, "write", setting), problem)
+        source.mistakes.add(problem, "write", setting)
     for wrap in _features(frozenset(facts.settings.model_fields_set)).wraps:
         tag = wrap(source.own, facts.settings, tag)
     return tag
 
 
-def address_of(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Address | None:
+def address_of(source: TagSource, driver: Addressing) -> Address | None:
     """Returns the address of the tag, or None after the mistake was noted."""
     try:
         return driver.address(source.own.address)
     except ConfigError as error:
-        mistakes.add((*source.path, "address"), str(error))
+        source.mistakes.add(str(error), "address")
         return None
 
 
-def _type(
-    source: TagSource,
-    settings: Any,
-    driver: Addressing,
-    address: Address,
-    mistakes: Mistakes,
-) -> ValueType:
+def _type(source: TagSource, settings: Any, driver: Addressing, address: Address) -> ValueType:
     area = driver.areas[address.area]
     default = default_type(driver, Unit.BIT if address.bit is not None else area.unit)
     wanted: ValueType | None = settings.type
@@ -148,7 +141,7 @@ def _type(
     if misfit is None:
         return wanted
     if source.sets("type"):
-        mistakes.add((*source.path, "type"), misfit)
+        source.mistakes.add(misfit, "type")
     return default
 
 
@@ -166,28 +159,23 @@ def _misfits(driver: Addressing, span: Span, facts: Facts) -> Iterator[Problem]:
 
 
 def _write(
-    source: TagSource,
-    settings: Any,
-    driver: Addressing,
-    span: Span,
-    kind: ValueType,
-    mistakes: Mistakes,
+    source: TagSource, settings: Any, driver: Addressing, span: Span, kind: ValueType
 ) -> WriteRule | None:
     """Returns the rule for writing; None where the tag cannot be written."""
-    setting, path = settings.write, (*source.path, "write")
+    setting = settings.write
     if setting is False:
         return None
     own, spelt = source.sets("write"), source.own.address
     area = driver.areas[span.area]
     if not area.writable:
         if own:
-            mistakes.add(path, f"{spelt} is read-only: {area.name} cannot be written")
+            source.mistakes.add(f"{spelt} is read-only: {area.name} cannot be written", "write")
         return None
     # A long array is written with several requests, each of whole elements.
     least = span._replace(size=span.size // kind.count) if kind.count else span
     if area.readable and driver.cost(span) is not None and driver.write_cost(least) is None:
         if own:
-            mistakes.add(path, f"{spelt} cannot be written with one request")
+            source.mistakes.add(f"{spelt} cannot be written with one request", "write")
         return None
     return rule_of(setting, kind, polled=settings.poll)
 
@@ -206,7 +194,7 @@ def most_that_fits(driver: Addressing, span: Span, kind: ValueType, *, write: bo
     return ""
 
 
-def check_overlaps(driver: Addressing, tags: Sequence[Tag], path: Path, mistakes: Mistakes) -> None:
+def check_overlaps(driver: Addressing, tags: Sequence[Tag], mistakes: Mistakes) -> None:
     """Notes tags that overlap and that no request can read together: each is read as a whole."""
     areas = {tag.span.area for tag in tags if tag.span.size > _LONG and tag.origin.shape is None}
     for area in areas:
@@ -216,8 +204,7 @@ def check_overlaps(driver: Addressing, tags: Sequence[Tag], path: Path, mistakes
             size = item.end - item.start
             if len(item.tags) > 1 and driver.cost(Span(area, item.start, size)) is None:
                 last = max(item.tags, key=lambda tag: tag.span.start + tag.span.size)
-                mistakes.add(
-                    (*path, last.name, "address"),
+                mistakes.at(last.name, "address").add(
                     f"{item.tags[0].text} to {last.text} overlap, and together they are {size} "
-                    "addresses, more than one request can carry: make them shorter",
+                    "addresses, more than one request can carry: make them shorter"
                 )

@@ -95,10 +95,10 @@ class Templates:
             names = [names]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             what = f"{shown(names)} is no list of files: write [pumps.yaml]"
-            self.mistakes.add(("templates_from",), what)
+            self.mistakes.add(what, "templates_from")
             return
         for name in names:
-            self._read(self.folder / name, ("templates_from",))
+            self._read(self.folder / name)
 
     def used(self, use: object, at: Origin, note: Note) -> list[Template]:
         """Returns the templates that `use` names, each after those that it uses itself.
@@ -150,16 +150,16 @@ class Templates:
         has = f"the file has {', '.join(own)}; " if own else ""
         return f": {has}docs/templates.md has those that are shipped"
 
-    def _read(self, path: FilePath, place: Path) -> None:
+    def _read(self, path: FilePath) -> None:
         try:
             file, mistakes = read_yaml(path, self.file.texts)
         except ConfigErrors as error:
             for message in error.messages:
-                self.mistakes.add(place, message)
+                self.mistakes.add(message, "templates_from")
             return
         self.mistakes.include(mistakes)
         for name in file.data.keys() - {"templates"}:
-            mistakes.add((name,), "a file of templates has `templates:` only")
+            mistakes.add("a file of templates has `templates:` only", name)
         self._take(file, mistakes)
 
     def _take(self, file: YamlFile, mistakes: Mistakes) -> None:
@@ -168,35 +168,34 @@ class Templates:
             return
         if not isinstance(raw, dict):
             what = f"{shown(raw)} stands where templates are expected, each as `name: settings`"
-            mistakes.add(("templates",), what)
+            mistakes.add(what, "templates")
             return
         for name, body in raw.items():
             path: Path = ("templates", name)
             if not isinstance(body, dict):
-                mistakes.add(path, f"{shown(body)} stands where settings are expected")
+                mistakes.add(f"{shown(body)} stands where settings are expected", *path)
                 continue
             if (other := self._known.get(name)) is not None:
                 at = f"{other.file.name}:{other.file.line(other.path)}"
-                mistakes.add(path, f"a template {name} is in {at} already")
+                mistakes.add(f"a template {name} is in {at} already", *path)
                 continue
             settings = {key: value for key, value in body.items() if key not in _NO_BODY}
-            parameters = _parameters(body.get("parameters"), path, mistakes)
+            parameters = _parameters(body.get("parameters"), mistakes.at(*path, "parameters"))
             self._known[name] = Template(name, file, path, settings, parameters, body.get("use"))
 
 
-def _parameters(raw: object, path: Path, mistakes: Mistakes) -> dict[str, Any]:
+def _parameters(raw: object, mistakes: Mistakes) -> dict[str, Any]:
     """Returns the defaults by name. A list has parameters without defaults."""
-    place = (*path, "parameters")
     if raw is None:
         return {}
     if isinstance(raw, list):
         raw = dict.fromkeys(map(str, raw))
     if not isinstance(raw, dict):
-        mistakes.add(place, f"{shown(raw)} stands where parameters are expected: [base, count]")
+        mistakes.add(f"{shown(raw)} stands where parameters are expected: [base, count]")
         return {}
     for name in raw:
         if not PARAMETER.match(name):
-            mistakes.add((*place, name), f"{name}: a parameter has letters, digits and _ only")
+            mistakes.add(f"{name}: a parameter has letters, digits and _ only", name)
         elif name in _RESERVED:
-            mistakes.add((*place, name), f"{name} has a meaning of its own: choose another name")
+            mistakes.add(f"{name} has a meaning of its own: choose another name", name)
     return raw

@@ -7,7 +7,7 @@ becomes a tag that is not polled.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from gateway.config.messages import Mistakes, Path, meant
+from gateway.config.messages import Mistakes, meant
 from gateway.config.settings.records import LineConfig
 from gateway.config.tags.section import TagDefaults, TagSection, TagSource
 from gateway.config.tags.word_tags import build_tag, check_overlaps
@@ -40,12 +40,12 @@ class Ranges:
     read: dict[str, Tag] = field(default_factory=dict)  # by key
     written: dict[str, Tag] = field(default_factory=dict)
 
-    def source(self, text: str, every: float | None, other: Tag | None, path: Path) -> Tag | None:
+    def source(self, text: str, every: float | None, other: Tag | None, to: Mistakes) -> Tag | None:
         """Returns the tag that is polled; at the shortest interval of its rows.
 
         `other`: the tag at the other end, if that is no range.
         """
-        tag = self._tag(text, READ, other, path, self._every(text) if every is None else every)
+        tag = self._tag(text, READ, other, to, self._every(text) if every is None else every)
         if tag is None:
             return None
         known = self.read.get(tag.key)
@@ -53,9 +53,9 @@ class Ranges:
             self.read[tag.key] = tag
         return self.read[tag.key]
 
-    def target(self, text: str, other: Tag | None, path: Path) -> Tag | None:
+    def target(self, text: str, other: Tag | None, to: Mistakes) -> Tag | None:
         """Returns the tag that is only written."""
-        tag = self._tag(text, WRITTEN, other, path, self._every(text), write=True)
+        tag = self._tag(text, WRITTEN, other, to, self._every(text), write=True)
         return None if tag is None else self.written.setdefault(tag.key, tag)
 
     def _every(self, text: str) -> float:
@@ -66,7 +66,7 @@ class Ranges:
         text: str,
         begin: str,
         other: Tag | None,
-        path: Path,
+        to: Mistakes,
         every: float,
         *,
         write: bool = False,
@@ -75,26 +75,26 @@ class Ranges:
         devices = {device.name: device for line in self.lines for device in line.devices}
         device = devices.get(name)
         if device is None:
-            self.mistakes.add(path, f"there is no device {name}: {meant(name, devices)}")
+            to.add(f"there is no device {name}: {meant(name, devices)}")
             return None
-        found = Mistakes(self.mistakes.places)
+        found = Mistakes(to.places, path=to.path)
         try:
             own = {**_section(device, spelt, other), "write": write}
         except ConfigError as error:
-            self.mistakes.add(path, str(error))
+            to.add(str(error))
             return None
         source = TagSource(
             name,
             f"{begin}{spelt.replace(':', '-')}",
             TagSection.model_validate(own),
             TagDefaults().model_copy(update={"every": every}),
-            path,
+            found,
         )
-        tag = build_tag(source, device.driver, found)
+        tag = build_tag(source, device.driver)
         if tag is not None and tag.key in {one.key for one in device.tags}:
-            found.add(path, f"{tag.key} is the name of this range: give that tag another name")
+            found.add(f"{tag.key} is the name of this range: give that tag another name")
         for problem in found.sentences():
-            self.mistakes.add(path, problem)
+            to.add(problem)
         if tag is None or len(found):
             return None
         origins = (line.not_real for line in self.lines if device in line.devices)
@@ -115,10 +115,9 @@ class Ranges:
         if not (read or written):
             return device
         found = Mistakes(self.mistakes.places)
-        path = ("lines", line.name, "devices", device.name, "tags")
-        check_overlaps(device.driver, (*device.wire_tags, *read), path, found)
+        check_overlaps(device.driver, (*device.wire_tags, *read), found)
         for problem in found.sentences():
-            self.mistakes.add(("transfers",), problem)
+            self.mistakes.add(problem, "transfers")
         return replace(device, tags=(*device.tags, *read), targets=written)
 
 

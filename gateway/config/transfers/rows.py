@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
-from gateway.config.messages import Mistakes, Path, similar
+from gateway.config.messages import Mistakes, similar
 from gateway.config.settings.records import LineConfig
 from gateway.config.settings.validate import section
 from gateway.config.tags.served import sort_of
@@ -44,12 +44,12 @@ class TransferRows:
         return ranges.added(), tuple(found)
 
     def _row(self, place: int, raw: object, finder: "_Finder") -> TransferRule | None:
-        path: Path = ("transfers", place)
-        own = section(TransferSection, raw, path, self.mistakes, "a transfer")
+        mistakes = self.mistakes.at("transfers", place)
+        own = section(TransferSection, raw, mistakes, "a transfer")
         if own is None:
             return None
-        before, wrong = len(self.mistakes), list[tuple[str, str]]()
-        source, target = finder.ends(own, path, wrong)
+        before, wrong = len(mistakes), list[tuple[str, str]]()
+        source, target = finder.ends(own, mistakes, wrong)
         if source is not None:
             wrong += finder.unreadable(source)
         if target is not None:
@@ -57,8 +57,8 @@ class TransferRows:
         if source is not None and target is not None:
             wrong += _misfits(own, source, target)
         for setting, problem in wrong:
-            self.mistakes.add((*path, *setting.split(".")), problem)
-        if len(self.mistakes) > before or source is None or target is None:
+            mistakes.add(problem, *setting.split("."))
+        if len(mistakes) > before or source is None or target is None:
             return None
         return TransferRule(
             number=place + 1,
@@ -80,7 +80,7 @@ class TransferRows:
             other = first.setdefault((rule.source, rule.target), rule.number)
             if other != rule.number:
                 text = f"row {other} carries {rule.text[0]} to {rule.text[1]} already"
-                self.mistakes.add(("transfers", rule.number - 1), f"{text}: remove one of the rows")
+                self.mistakes.add(f"{text}: remove one of the rows", "transfers", rule.number - 1)
 
     def _check_loops(self, rows: Sequence[tuple[TransferRule, Tag, Tag]]) -> None:
         """Notes loops: a row writes what another one, or the same one, reads."""
@@ -101,7 +101,7 @@ class TransferRows:
         while loop := _loop(after):
             way = ", ".join(f"row {number} ({names[number]})" for number in loop)
             text = f"a loop: {way}: a value would follow from itself; remove one of the rows"
-            self.mistakes.add(("transfers", max(loop) - 1), text)
+            self.mistakes.add(text, "transfers", max(loop) - 1)
             del after[max(loop)]
 
 
@@ -119,18 +119,18 @@ class _Finder:
         return cls(tags, devices, ranges, certain)
 
     def ends(
-        self, own: TransferSection, path: Path, wrong: list[tuple[str, str]]
+        self, own: TransferSection, mistakes: Mistakes, wrong: list[tuple[str, str]]
     ) -> tuple[Tag | None, Tag | None]:
         """Returns source and target, or notes what would be right. Tags come before ranges."""
         source = None if is_range(own.from_) else self.find(own.from_, "from", wrong)
         target = None if is_range(own.to) else self.find(own.to, "to", wrong)
         if is_range(own.from_):
-            found = self.ranges.source(own.from_, own.every, target, (*path, "from"))
-            return found, target or self._target(own, found, path)
-        return source, target or self._target(own, source, path)
+            found = self.ranges.source(own.from_, own.every, target, mistakes.at("from"))
+            return found, target or self._target(own, found, mistakes)
+        return source, target or self._target(own, source, mistakes)
 
-    def _target(self, own: TransferSection, source: Tag | None, path: Path) -> Tag | None:
-        return self.ranges.target(own.to, source, (*path, "to")) if is_range(own.to) else None
+    def _target(self, own: TransferSection, source: Tag | None, mistakes: Mistakes) -> Tag | None:
+        return self.ranges.target(own.to, source, mistakes.at("to")) if is_range(own.to) else None
 
     def find(self, text: str, setting: str, wrong: list[tuple[str, str]]) -> Tag | None:
         """Returns the tag, or notes what would be right."""

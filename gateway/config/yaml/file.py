@@ -109,7 +109,7 @@ class YamlFile:
                 [f"{self.name}:{line_of(node.start_mark)}: its anchors repeat without end"]
             )
         if node.tag not in _PLAIN_TAGS:
-            mistakes.add(path, f"{node.tag!r} cannot be used here: write the value alone")
+            mistakes.add(f"{node.tag!r} cannot be used here: write the value alone", *path)
             return None
         if isinstance(node, yaml.ScalarNode):
             text = str(node.value)
@@ -137,12 +137,11 @@ class YamlFile:
         for key, _ in node.value:
             line = line_of(key.start_mark)
             if not isinstance(key, yaml.ScalarNode):
-                mistakes.add(path, f"the key in line {line} is no plain name")
+                mistakes.add(f"the key in line {line} is no plain name", *path)
             elif key.value in first and not _is_merge(key):
                 both = "in one line" if first[key.value] == line else f"in line {line}"
-                mistakes.add(
-                    (*path, key.value),
-                    f"written twice, here and again {both}: only one of them can be meant",
+                mistakes.at(*path, key.value).add(
+                    f"written twice, here and again {both}: only one of them can be meant"
                 )
             else:
                 first[key.value] = line
@@ -151,13 +150,13 @@ class YamlFile:
         merges = [(line_of(key.start_mark), value) for key, value in node.value if _is_merge(key)]
         for line, value in merges:
             if not all(isinstance(one, yaml.MappingNode) for one in _parts(value)):
-                mistakes.add(
-                    path, f"the `<<` in line {line} brings in no settings: write it as `<<: *name`"
+                mistakes.at(*path).add(
+                    f"the `<<` in line {line} brings in no settings: write it as `<<: *name`"
                 )
         if len(merges) > 1:
             lines = " and ".join(str(line) for line, _ in merges)
-            mistakes.add(
-                path, f"`<<` is written twice, in lines {lines}: write one, `<<: [*first, *second]`"
+            mistakes.at(*path).add(
+                f"`<<` is written twice, in lines {lines}: write one, `<<: [*first, *second]`"
             )
 
     def _of(self, node: yaml.MappingNode) -> Entries:

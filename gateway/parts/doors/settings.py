@@ -3,9 +3,10 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
 from typing import Annotated
 
-from gateway.config.messages import Path, meant, one_of, shown
+from gateway.config.messages import Mistakes, meant, one_of, shown
 from gateway.config.port_rules import SHOWS_ONE
 from gateway.config.settings import parsers
 from gateway.config.settings.model import LineTlsSection
@@ -148,55 +149,51 @@ def _place(settings: ShareSection | None, place: Place) -> Sharing | None:
         return None
     found, ports = list[Door](), dict[TcpAddress | SerialPath, str]()
     for name, section in settings.doors.items():
-        path: Path = ("share", "doors", name)
+        own = place.mistakes.at("share", "doors", name)
         other = ports.setdefault(section.listen, name)
         if other != name:
-            place.mistakes.add((*path, "listen"), f"door {other} listens there already")
-        if (door := _door(name, section, path, place)) is not None:
+            own.add(f"door {other} listens there already", "listen")
+        if (door := _door(name, section, own, place)) is not None:
             found.append(door)
     return Sharing(tuple(found))
 
 
-def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | None:
-    mistakes, lines = place.mistakes, {line.name: line for line in place.lines}
+def _door(name: str, section: DoorSection, mistakes: Mistakes, place: Place) -> Door | None:
+    lines = {line.name: line for line in place.lines}
     if wrong := _why_not_reached(section):
-        mistakes.add((*path, "allow"), wrong)
+        mistakes.add(wrong, "allow")
     if section.reply_within > LONGEST_WAIT:
-        mistakes.add((*path, "reply_within"), f"at most {LONGEST_WAIT:g}s: no program waits longer")
+        mistakes.add(f"at most {LONGEST_WAIT:g}s: no program waits longer", "reply_within")
     line = lines.get(section.line)
     if line is None:
-        mistakes.add(
-            (*path, "line"), f"there is no line {section.line}: {meant(section.line, lines)}"
-        )
+        mistakes.add(f"there is no line {section.line}: {meant(section.line, lines)}", "line")
         return None
     if why := _why_not(line, raw=section.protocol in ALONE):
-        mistakes.add((*path, "line"), f"{line.name} {why}")
+        mistakes.add(f"{line.name} {why}", "line")
         return None
     devices = {one.name: one for one in _spoken(line, section.protocol)}
     if section.protocol in ALONE and section.writes:
         text = (
             f"a door with {section.protocol} passes on all that the program sends: remove `writes`"
         )
-        mistakes.add((*path, "writes"), text)
+        mistakes.add(text, "writes")
         return None
     if section.protocol == RFC2217 and isinstance(section.listen, SerialPath):
         text = "a terminal has its own settings, which are followed with `raw`"
-        mistakes.add((*path, "protocol"), text)
+        mistakes.add(text, "protocol")
         return None
     if not devices and section.protocol not in ALONE:
         known = sorted({name for one in line.devices for name in relatives(one.driver.protocol)})
         text = f"its devices can be asked by {one_of(known)}" if known else "none can be asked"
-        mistakes.add(
-            (*path, "protocol"), f"no device of {line.name} for {section.protocol}: {text}"
-        )
+        mistakes.add(f"no device of {line.name} for {section.protocol}: {text}", "protocol")
         return None
     return Door(
         name,
         line.name,
-        _secured_port(section, path, place),
+        _secured_port(section, mistakes.at("tls"), place.folder),
         section.protocol,
         section.allow or (),
-        _writes(section, devices, path, place),
+        _writes(section, devices, mistakes.at("writes")),
         USUAL_SHARE if section.most is None else section.most,
         section.reply_within,
         section.idle,
@@ -204,22 +201,24 @@ def _door(name: str, section: DoorSection, path: Path, place: Place) -> Door | N
     )
 
 
-def _secured_port(section: DoorSection, path: Path, place: Place) -> TcpAddress | SerialPath:
+def _secured_port(
+    section: DoorSection, mistakes: Mistakes, folder: FilePath
+) -> TcpAddress | SerialPath:
     """Returns the address with its certificates."""
-    where, own, path = section.listen, section.tls, (*path, "tls")
+    where, own = section.listen, section.tls
     if own is None:
         return where
     if isinstance(where, SerialPath):
-        place.mistakes.add(path, "a terminal has no TLS: remove `tls`")
+        mistakes.add("a terminal has no TLS: remove `tls`")
         return where
     if own.certificate is None:
-        place.mistakes.add(path, SHOWS_ONE)
+        mistakes.add(SHOWS_ONE)
     if own.writers and not own.mutual:
         text = "roles are in the certificates of programs: they need `mutual: true`"
-        place.mistakes.add((*path, "writers"), text)
+        mistakes.add(text, "writers")
     if own.name:
-        place.mistakes.add((*path, "name"), "programs have roles: `writers`")
-    return replace(where, tls=tls_files(own.record(), place.folder, path, place.mistakes))
+        mistakes.add("programs have roles: `writers`", "name")
+    return replace(where, tls=tls_files(own.record(), folder, mistakes))
 
 
 def _why_not_reached(section: DoorSection) -> str:
@@ -234,13 +233,13 @@ def _why_not_reached(section: DoorSection) -> str:
 
 
 def _writes(
-    section: DoorSection, devices: Mapping[str, DeviceSettings], path: Path, place: Place
+    section: DoorSection, devices: Mapping[str, DeviceSettings], mistakes: Mistakes
 ) -> Mapping[str, tuple[Span, ...]]:
     found = dict[str, tuple[Span, ...]]()
     for name, texts in section.writes.items():
         if name not in devices:
             text = f"the door has no device {name}: {meant(name, devices)}"
-            place.mistakes.add((*path, "writes", name), text)
+            mistakes.add(text, name)
             continue
         spans = list[Span]()
         for number, text in enumerate(texts):
@@ -248,7 +247,7 @@ def _writes(
                 area, numbers = addresses(devices[name].driver, text, _MOST_WRITTEN)
                 spans.append(Span(area, numbers.start, len(numbers)))
             except ConfigError as error:
-                place.mistakes.add((*path, "writes", name, number), str(error))
+                mistakes.add(str(error), name, number)
         found[name] = tuple(spans)
     return found
 

@@ -28,18 +28,16 @@ class HistorySection(Section):
 def _place(settings: HistorySection | None, place: Place) -> HistorySection | None:
     if settings is None:
         if place.recorded is not None:
-            place.mistakes.add(
-                (*place.recorded, "history"),
+            place.mistakes.at(*place.recorded, "history").add(
                 "the file has no `history:` section: write `history: {path: history.db}` beside "
-                "`lines:`",
+                "`lines:`"
             )
         return None
     path = place.written(settings.path)
     if place.state_file is not None and realpath(path) == realpath(place.state_file):
-        place.mistakes.add(
-            ("gateway", "state"),
+        place.mistakes.at("gateway", "state").add(
             f"history is kept in {settings.path}: two files are needed, such as "
-            "history.db and state.json",
+            "history.db and state.json"
         )
     return settings.model_copy(update={"path": path})
 

@@ -231,7 +231,7 @@ def _place(settings: NotifySection | None, place: Place) -> NotifySection | None
     for number, rule in enumerate(settings.rules):
         for which, way in enumerate(rule.to):
             if why := _why_not(settings, way):
-                place.mistakes.add(("notify", "rules", number, "to", which), why)
+                place.mistakes.add(why, "notify", "rules", number, "to", which)
     for name in ("mail", "mqtt"):
         if (section := getattr(settings, name)) is not None:
             _check_server(name, section, place.mistakes)
@@ -240,7 +240,7 @@ def _place(settings: NotifySection | None, place: Place) -> NotifySection | None
         if telephone.line not in dial:
             why = f"is no line whose modem dials: {meant(telephone.line, dial)}"
             at = ("notify", "telephone", "line")
-            place.mistakes.add(at, f"{shown(telephone.line)} {why}")
+            place.mistakes.add(f"{shown(telephone.line)} {why}", *at)
     files: dict[str, Any] = {"path": place.written(settings.path)}
     for name, setting, file in _files(settings):
         found = place.existing(file, "notify", name, setting)
@@ -264,10 +264,10 @@ def _check_server(name: str, section: Any, mistakes: Mistakes) -> None:
     setting: Setting = ("notify", name)
     user, password = section.user, section.password_file
     if (user is None) != (password is None):
-        mistakes.add(setting, "user and password_file belong together: write both or none")
+        mistakes.add("user and password_file belong together: write both or none", *setting)
     if user and name == "mqtt" and section.broker.scheme == name and not section.broker.is_local:
         text = "mqtt:// would show the password to the network: write mqtts://"
-        mistakes.add((*setting, "broker"), text)
+        mistakes.add(text, *setting, "broker")
 
 
 def _files(settings: NotifySection) -> list[tuple[str, str, Path | None]]:

@@ -26,9 +26,9 @@ def _place(settings: RemoteSection | None, place: Place) -> RemoteSection | None
         return None
     if not place.has_writers:
         text = "it needs writers: {file: writers.txt}: a file must have the signature of a writer"
-        place.mistakes.add(("remote", "writers"), text)
+        place.mistakes.add(text, "remote", "writers")
     if settings.confirm > LONGEST_WAIT:
-        place.mistakes.add(("remote", "confirm"), "it is longer than a day")
+        place.mistakes.add("it is longer than a day", "remote", "confirm")
     return settings.model_copy(update={"path": place.written(settings.path)})
 
 

@@ -63,14 +63,13 @@ def _place(settings: WebSection | None, place: Place) -> WebSection | None:
     if settings is None:
         return None
     if settings.tokens_file is None and not settings.is_local:
-        place.mistakes.add(
-            ("web", "listen"),
+        place.mistakes.at("web", "listen").add(
             f"other machines can reach {settings.host}: name a tokens_file too (see docs/page.md), "
-            f"or listen on 127.0.0.1:{settings.port}",
+            f"or listen on 127.0.0.1:{settings.port}"
         )
     for number, pattern in enumerate(settings.overview):
         if not any(fnmatchcase(tag.key, pattern) for tag in place.tags):
-            place.mistakes.add(("web", "overview", number), f"there is no tag {pattern}")
+            place.mistakes.add(f"there is no tag {pattern}", "web", "overview", number)
     files: dict[str, Any] = {
         "tokens_file": place.existing(settings.tokens_file, "web", "tokens_file")
     }
@@ -80,8 +79,8 @@ def _place(settings: WebSection | None, place: Place) -> WebSection | None:
     if isinstance(settings.fleet, Path):
         files["fleet"] = place.folder / settings.fleet
         if not (place.mistakes.elsewhere or files["fleet"].is_dir()):
-            place.mistakes.add(
-                ("web", "fleet"), f"{files['fleet']} is no folder: write true for none"
+            place.mistakes.at("web", "fleet").add(
+                f"{files['fleet']} is no folder: write true for none"
             )
     return settings.model_copy(update=files)
 

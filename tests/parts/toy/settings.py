@@ -15,7 +15,7 @@ class ToySection(Section):
 
 def _place(settings: ToySection | None, place: Place) -> Any:
     if settings is not None and not settings.greeting:
-        place.mistakes.add(("toy", "greeting"), "an empty greeting greets nobody: write hello")
+        place.mistakes.add("an empty greeting greets nobody: write hello", "toy", "greeting")
     return settings
 
 

@@ -33,40 +33,36 @@ def _check(own: Any, facts: Facts) -> Iterator[Problem]:
 FEATURE = Feature(own=BitsSettings, check=_check)
 
 
-def with_bits(
-    rows: Mapping[str, object], path: Path, driver: Addressing | None, mistakes: Mistakes
-) -> Rows:
-    """Yields name, settings and place of each tag; for a tag with bits, of each of its bits."""
+def with_bits(rows: Mapping[str, object], driver: Addressing | None, mistakes: Mistakes) -> Rows:
+    """Yields name, settings and place below `tags` of each tag; of a tag with bits, of each bit."""
     for name, raw in rows.items():
         if isinstance(raw, dict) and "bits" in raw and driver is not None:
-            yield from _bits(name, raw, (*path, name), driver, mistakes)
+            yield from _bits(name, raw, driver, mistakes.at(name))
         else:
-            yield name, raw, (*path, name)
+            yield name, raw, (name,)
 
 
-def _bits(
-    name: str, raw: Mapping[str, Any], place: Path, driver: Addressing, mistakes: Mistakes
-) -> Rows:
+def _bits(name: str, raw: Mapping[str, Any], driver: Addressing, mistakes: Mistakes) -> Rows:
     try:
         bits = shaping_parsers.bits(raw["bits"])
     except ConfigError as error:
-        mistakes.add((*place, "bits"), str(error))
+        mistakes.add(str(error), "bits")
         return
     rest = {setting: value for setting, value in raw.items() if setting != "bits"}
     try:
         address = driver.address(str(raw.get("address", "")))
     except ConfigError:
-        yield name, rest, place  # its mistake is found there
+        yield name, rest, (name,)  # its mistake is found there
         return
     if isinstance(driver, TypedFields):
-        mistakes.add((*place, "bits"), "a field of a frame has no bits: declare fields of one bit")
+        mistakes.add("a field of a frame has no bits: declare fields of one bit", "bits")
         return
     if address.bit is not None or driver.areas[address.area].unit is not Unit.WORD:
         spelt = driver.spell(address)
-        mistakes.add((*place, "bits"), f"{spelt} is no word of 16 bits: remove bits")
+        mistakes.add(f"{spelt} is no word of 16 bits: remove bits", "bits")
         return
     for bit, entry in bits.items():
         own = {"name": entry} if isinstance(entry, str) else dict(entry)
-        inner = place if isinstance(entry, str) else (*place, "bits", str(bit))
+        inner = (name,) if isinstance(entry, str) else (name, "bits", str(bit))
         spelt = driver.spell(address._replace(bit=bit))
         yield f"{name}/{own.pop('name')}", {**rest, **own, "address": spelt}, inner
