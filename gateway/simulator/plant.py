@@ -82,7 +82,7 @@ def _motion(tag: Tag, number: int) -> Callable[[float], Value]:
 
 
 def _period(number: int) -> float:
-    return 20.0 + 7 * (number % 11)
+    return 60.0 + 7 * (number % 11)  # an alarm at a limit of each is no flood
 
 
 @lru_cache(maxsize=1024)

@@ -200,6 +200,28 @@ async def test_an_alarm_is_acknowledged_and_a_value_written_after_one_sign_in(
         assert await tab.value(kept) == 0  # the token is in the storage of this tab only
 
 
+async def test_all_alarms_of_a_filter_are_acknowledged_at_once(tab: Tab, tokens: Path) -> None:
+    rule = AlarmRule({Level.HIGH: 80.0}, text="Too hot")
+    names = [f"{place}-{number:03}" for place in ("east", "west") for number in range(200)]
+    plant = PlainPlant(PlainDevice("oven", tuple(tag("oven", name, alarm=rule) for name in names)))
+    plant.alarms.judge([plant.now(f"oven/{name}", 90.0) for name in names])
+    async with serving(plant=plant, tokens_file=tokens) as client:
+        client.north.orders = client.plant.parts.alarms.order
+        await opened(tab, client, "alarms")
+        rows = "document.querySelectorAll('#alarms-list > .alarm').length"
+        await tab.until(f"{rows} === 300 && {text('#alarms-list')}.endsWith('and 100 more')")
+        await tab.click("#account")
+        await sign_in(tab)
+        await tab.until(f"{text('#acknowledge-all')} === 'Acknowledge all 400'")
+        await tab.value("document.getElementById('alarm-filter').focus()")
+        await tab.type("WEST hot")
+        await tab.until(f"{rows} === 200 && {text('#acknowledge-all')} === 'Acknowledge all 200'")
+        await tab.click("#acknowledge-all")
+        await tab.until(f"{text('#acknowledge-result')} === '200 alarms acknowledged'")
+        await tab.until(f"{text('#alarms-head')} === 'Alarms: 200 to acknowledge, 400 in all'")
+        assert {key.partition("-")[0] for key, _, _ in client.north.written} == {"oven/west"}
+
+
 async def test_a_wrong_token_is_said_and_not_kept(tab: Tab, tokens: Path) -> None:
     async with serving(plant=oven(), tokens_file=tokens) as client:
         await opened(tab, client)

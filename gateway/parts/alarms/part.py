@@ -37,7 +37,7 @@ LOOK_EVERY = 1.0  # seconds between two looks at the conditions
 FAULTS_EVERY = 5.0  # seconds between two looks at the faults of the gateway
 MOST_SHOWN = 50  # on the status page
 STATES = ("open", "suppressed", "all", *State)  # of a list
-_BATCH_SIZE = 500  # alarms in one turn of the loop
+_BATCH_SIZE = 2000  # alarms in one turn of the loop
 
 
 class AlarmPart:

@@ -8,7 +8,9 @@ import { unitOf } from "./values.js";
 const SHORT = 6; // in the overview
 const PAGE = 1000; // alarms of one request
 const MOST = 5000;
-const EVERY = 4000; // ms between two requests for what is not in the events
+const ROWS = 300; // in the list: a browser stands still with thousands
+const AT_ONCE = 6; // orders: more wait in the browser
+const EVERY = 4000; // ms between two requests for what is not in the events; of a thousand alarms
 const PAST_EVERY = 10_000; // ms
 const LEVELS = {
   high_high: t("far too high"), high: t("too high"), low: t("too low"), low_low: t("far too low"), on: t("on"), off: t("off"),
@@ -29,7 +31,7 @@ on("state", async ({ alarms }) => {
   showPast(PAST_EVERY);
   if (!alarms.more) return takeAll(alarms.shown);
   if (!all.length) takeAll(alarms.shown);
-  if (performance.now() - asked < EVERY) return;
+  if (performance.now() - asked < EVERY * Math.max(1, all.length / PAGE)) return;
   asked = performance.now();
   const found = [];
   for (let after = ""; after !== null && found.length < MOST; ) {
@@ -44,23 +46,42 @@ on("state", async ({ alarms }) => {
 function takeAll(alarms) {
   all = alarms.map((one) => ({ ...one, why: why(one) }));
   byTag = new Map(all.map((one) => [one.alarm, one]));
-  const open = all.filter((one) => one.state !== "acknowledged");
+  const open = all.filter(waits);
   put("alarm-count", String(open.length));
   byId("alarm-count").hidden = !open.length;
-  byId("acknowledge-all").hidden = open.length < 2 || !gateway.you[1];
-  put("acknowledge-all", t("Acknowledge all {n}", { n: open.length }));
   put("alarms-head", all.length ? t("Alarms: {n} to acknowledge, {all} in all", { n: open.length, all: all.length }) : t("Alarms: none"));
   showAll();
   for (const watcher of watchers) watcher();
 }
 
+const waits = (one) => one.state !== "acknowledged";
+
+// Returns the alarms that have each word of the filter.
+function filtered() {
+  const words = byId("alarm-filter").value.toLowerCase().split(/\s+/).filter(Boolean);
+  if (!words.length) return all;
+  return all.filter((one) => {
+    const text = `${one.alarm} ${one.why} ${one.detail ?? ""} ${said(one.priority)} ${one.state}`.toLowerCase();
+    return words.every((word) => text.includes(word));
+  });
+}
+
 function showAll() {
   const full = !byId("view-alarms").hidden;
   const list = byId(full ? "alarms-list" : "alarms-short");
-  keyed(list, full ? all : all.slice(0, SHORT), (one) => one.alarm, makeRow, showRow);
-  if (!all.length) list.append(h("li", { className: "soft" }, t("None.")));
-  else if (!full && all.length > SHORT) list.append(h("li", {}, h("a", { href: "#alarms" }, t("and {n} more", { n: all.length - SHORT }))));
+  const found = full ? filtered() : all;
+  const rows = found.slice(0, full ? ROWS : SHORT);
+  keyed(list, rows, (one) => one.alarm, makeRow, showRow);
+  const more = t("and {n} more", { n: found.length - rows.length });
+  if (!found.length) list.append(h("li", { className: "soft" }, t("None.")));
+  else if (found.length > rows.length) list.append(h("li", { className: "soft" }, full ? more : h("a", { href: "#alarms" }, more)));
+  const open = found.filter(waits).length;
+  byId("alarm-filter").hidden = all.length < 2;
+  byId("acknowledge-all").hidden = open < 2 || !gateway.you[1];
+  put("acknowledge-all", t("Acknowledge all {n}", { n: open }));
 }
+
+byId("alarm-filter").addEventListener("input", showAll);
 
 addEventListener("hashchange", () => { showAll(); showPast(); });
 byId("past-span").addEventListener("change", () => showPast());
@@ -180,26 +201,30 @@ async function order({ alarm }, fields, done) {
 // The time of the alarm goes with it: an alarm that was raised again meanwhile is not acknowledged.
 async function acknowledge(...alarms) {
   if (!(await signedIn())) return;
-  let done = 0;
+  const done = new Map(); // documents by alarm
   let by = "";
-  const wrong = [];
-  for (const { alarm, raised } of alarms) {
-    put("acknowledge-result", t("acknowledging {alarm} …", { alarm }));
-    try {
-      const { ok, found } = await post("alarms/acknowledge", { alarm }, JSON.stringify({ by: operator(), raised }));
-      if (!ok) wrong.push(`${alarm}: ${said(found.reason ?? found.error)}`);
-      else {
-        done += 1;
-        by = found.acknowledged?.by ?? operator(); // another operator may have been faster
-        takeAll(all.map((one) => (one.alarm === alarm ? found : one)).filter((one) => one.state !== "normal"));
+  const [wrong, left] = [[], [...alarms]];
+  const next = async () => {
+    for (let one = left.shift(); one; one = left.shift()) {
+      const { alarm, raised } = one;
+      put("acknowledge-result", alarms.length === 1 ? t("acknowledging {alarm} …", { alarm }) : t("acknowledging: {n} left …", { n: left.length + 1 }));
+      try {
+        const { ok, found } = await post("alarms/acknowledge", { alarm }, JSON.stringify({ by: operator(), raised }));
+        if (!ok) wrong.push(`${alarm}: ${said(found.reason ?? found.error)}`);
+        else {
+          done.set(alarm, found);
+          by = found.acknowledged?.by ?? operator(); // another operator may have been faster
+        }
+      } catch {
+        wrong.push(`${alarm}: ${t("the connection ended; it is not known whether it is done")}`);
+        left.length = 0;
       }
-    } catch {
-      wrong.push(`${alarm}: ${t("the connection ended; it is not known whether it is done")}`);
-      break;
     }
-  }
-  const first = done === 1 && alarms.length === 1 ? `${alarms[0].alarm}: ${t("acknowledged")} ${t("by {name}", { name: by })}` : done ? several(done, "{n} alarm acknowledged", "{n} alarms acknowledged") : "";
+  };
+  await Promise.all(Array.from({ length: AT_ONCE }, next));
+  takeAll(all.map((one) => done.get(one.alarm) ?? one).filter((one) => one.state !== "normal"));
+  const first = done.size === 1 && alarms.length === 1 ? `${alarms[0].alarm}: ${t("acknowledged")} ${t("by {name}", { name: by })}` : done.size ? several(done.size, "{n} alarm acknowledged", "{n} alarms acknowledged") : "";
   put("acknowledge-result", [first, ...wrong.slice(0, 5)].filter(Boolean).join(". "));
 }
 
-byId("acknowledge-all").addEventListener("click", () => acknowledge(...all.filter((one) => one.state !== "acknowledged")));
+byId("acknowledge-all").addEventListener("click", () => acknowledge(...filtered().filter(waits)));

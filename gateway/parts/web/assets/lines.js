@@ -87,7 +87,7 @@ function showWrong(state) {
     put(item.head, head + item.colon);
     put(item.rest, rest);
   });
-  if (!sentences.length) list.append(h("li", { className: "well" }, t("Nothing is wrong.")));
+  if (!sentences.length) list.append(h("li", { className: "well" }, t("No faults.")));
   if (sentences.length > SHORT) {
     const fold = () => {
       all = !all;

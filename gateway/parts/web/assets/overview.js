@@ -10,6 +10,7 @@ import { writeButton } from "./writing.js";
 const PAST = "[now(-15m)..]";
 const STEP = "3s"; // of the past in a sparkline
 const AT_ONCE = 2; // queries of the past
+const PENS = 3; // of the first trend
 
 let shown = []; // keys
 let pinned = JSON.parse(localStorage.getItem("overview") ?? "null"); // keys chosen on this page
@@ -48,6 +49,8 @@ function showTiles(keys) {
   fill();
   showAll();
   if (!keys.length) byId("tiles").replaceChildren(h("li", { className: "soft" }, t("No tag is chosen.")));
+  const curves = keys.filter((key) => !tagOf(key).meta.length && tagOf(key).meta.type !== "string").slice(0, PENS);
+  document.querySelector("[data-view=trend]").href = curves.length ? `#trend?tags=${encodeURIComponent(curves.join(","))}` : "#trend";
   byId("chosen").replaceChildren(
     ...(pinned ? [t("Chosen on this page."), " ", h("button", { type: "button", className: "link", onclick: unpin }, t("Show the choice of the file"))] : []),
   );
@@ -116,7 +119,7 @@ function showTile(tile, key) {
   put(tile.limits, limits(tag));
   drawSpark(tile.spark, tag);
   const alarm = alarmsOf(key);
-  put(tile.alarm, alarm ? alarm.why : "");
+  put(tile.alarm, !alarm ? "" : alarm.state === "returned" ? t("{why}: over, to acknowledge", alarm) : alarm.why);
   tile.alarm.title = tile.alarm.textContent;
   tile.alarm.hidden = !alarm;
   const bad = tag.last && !tag.last.good;
