@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
+from heapq import nsmallest
 from itertools import islice
 
 from gateway.contract import payload
@@ -16,20 +18,25 @@ MOST_CHOSEN = 200  # tags by key
 NO_TILE = (Kind.STRING,)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Known:
     """The tags of the present file, in its order."""
 
     devices: object  # as the plant returned them; others after a reload
     places: Mapping[str, int]  # by key
     tags: Sequence[Tag]
-    texts: Sequence[str]  # what a search looks at
 
-    def overview(self) -> list[Tag]:
-        """Returns tags with an alarm, then those with a history, with a unit, and others."""
+    @cached_property
+    def texts(self) -> Sequence[str]:
+        """What a search looks at."""
+        return [f"{tag.key} {tag.label.description}".lower() for tag in self.tags]
+
+    @cached_property
+    def overview(self) -> Sequence[Tag]:
+        """Tags with an alarm, then those with a history, with a unit, and others."""
         scalar = [one for one in self.tags if not one.layout.type.count]
         shown = [one for one in scalar if one.layout.type.kind not in NO_TILE] or scalar
-        ranked = sorted(shown, key=_rank)[:MOST_OF_OVERVIEW]
+        ranked = nsmallest(MOST_OF_OVERVIEW, shown, key=_rank)
         return sorted(ranked, key=lambda one: self.places[one.key])
 
 
@@ -44,7 +51,7 @@ class TagList:
     def __init__(self, plant: Plant, overview: Sequence[str]) -> None:
         self._plant = plant
         self._overview = overview
-        self._last = _Known(None, {}, (), ())
+        self._last = _Known(None, {}, ())
 
     @property
     def _known(self) -> _Known:
@@ -52,8 +59,7 @@ class TagList:
         if self._last.devices is not devices:
             tags = [tag for device in devices for tag in device.tags]
             places = {tag.key: place for place, tag in enumerate(tags)}
-            texts = [f"{tag.key} {tag.label.description}".lower() for tag in tags]
-            self._last = _Known(devices, places, tags, texts)
+            self._last = _Known(devices, places, tags)
         return self._last
 
     def has_device(self, name: str) -> bool:
@@ -76,7 +82,7 @@ class TagList:
         known = self._known
         wanted = self._overview if keys is None else keys.split(",")
         if not wanted:
-            return known.overview()
+            return [*known.overview]
         found: dict[Tag, None] = {}
         for key in wanted[:MOST_CHOSEN]:
             if "*" in key:

@@ -13,6 +13,7 @@ const AT_ONCE = 2; // queries of the past
 const PENS = 3; // of the first trend
 
 let shown = []; // keys
+let loads = 0; // under way
 let pinned = JSON.parse(localStorage.getItem("overview") ?? "null"); // keys chosen on this page
 
 export const isPinned = (key) => (pinned ?? shown).includes(key);
@@ -35,6 +36,11 @@ export function choose() {
 }
 
 async function load() {
+  loads += 1;
+  await loadTiles().finally(() => (loads -= 1));
+}
+
+async function loadTiles() {
   const tags = pinned?.join(",") ?? "";
   if (pinned?.length === 0) return showTiles([]);
   const reply = await api("tags", { tags, limit: 200 }).catch(() => null);
@@ -142,7 +148,7 @@ on("begin", () => {
 });
 on("values", (values) => {
   const keys = values.map(([key]) => key);
-  if (begun && keys.join() !== shown.join()) load(); // the file was changed, or could not be read before
+  if (begun && !loads && keys.join() !== shown.join()) load(); // the file was changed, or could not be read before
   begun = false;
   for (const [key, text, quality, time, why, name] of values) take(tagOf(key), { text, quality, time, why, name });
   showAll();
