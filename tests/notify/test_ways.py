@@ -183,10 +183,27 @@ async def test_a_webhook_that_is_not_answered_by_success_is_not_sent(
     tmp_path: Path, status: int, headers: dict[str, str]
 ) -> None:
     async def refuse(_request: web.Request) -> web.Response:
-        return web.Response(status=status, headers=headers)
+        return web.Response(status=status, headers=headers, reason="x" * 5000)
 
-    with pytest.raises(GatewayError, match=f"answers {status}"):
+    with pytest.raises(GatewayError, match=f"answers {status} xxx") as raised:
         await _answered(tmp_path, refuse)
+    assert len(str(raised.value)) == 200  # it is shown in status and log
+
+
+async def test_an_answer_without_an_end_is_a_success_at_once(tmp_path: Path) -> None:
+    """Waiting for its end would send the message again, for ever."""
+
+    async def dribble(request: web.Request) -> web.StreamResponse:
+        answer = web.StreamResponse()
+        await answer.prepare(request)
+        with suppress(ConnectionError):
+            while True:
+                await answer.write(b"x")
+                await asyncio.sleep(0)
+        return answer
+
+    async with asyncio.timeout(20):  # the way itself would end after 30 s
+        await _answered(tmp_path, dribble)
 
 
 async def test_the_url_of_a_webhook_is_in_no_error(tmp_path: Path) -> None:

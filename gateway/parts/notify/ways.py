@@ -133,7 +133,8 @@ class _Webhook:
                 ) as answer,
             ):
                 if not 200 <= answer.status < 300:
-                    raise GatewayError(f"the server answers {answer.status} {answer.reason}")
+                    text = f"the server answers {answer.status} {answer.reason}"
+                    raise GatewayError(said(GatewayError(text)))
         except aiohttp.ClientResponseError:  # its text has the URL, which may hold a secret
             raise GatewayError("the server answers something that is no HTTP") from None
         except aiohttp.InvalidURL:

@@ -133,7 +133,7 @@ async def _send(
         except (TimeoutError, ConnectionError):
             drop(request)
             return
-        await asyncio.sleep(WIRE_EVERY)
+        await asyncio.sleep(WIRE_EVERY if page.has_state else 0)
 
 
 @dataclass(eq=False)
@@ -151,11 +151,16 @@ class Page:
     _values_due: float = 0.0
     _state_due: float = 0.0
 
+    @property
+    def has_state(self) -> bool:
+        return self._state_due > 0
+
     async def next(self, client: Who) -> bytes:
-        """Returns the events that are due; at least the time."""
+        """Returns the events that are due; at least the time. The first values do not wait for the
+        state, which may take a while on a busy machine."""
         loop = asyncio.get_running_loop()
         events = []
-        if self._state_due <= loop.time():
+        if self._values_due and self._state_due <= loop.time():
             documents = await self._core.north.documents(STATE_EVERY)
             self._state_due = loop.time() + STATE_EVERY
             events.append(_event("state", self._state(documents, client)))

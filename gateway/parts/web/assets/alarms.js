@@ -209,7 +209,8 @@ async function acknowledge(...alarms) {
       const { alarm, raised } = one;
       put("acknowledge-result", alarms.length === 1 ? t("acknowledging {alarm} …", { alarm }) : t("acknowledging: {n} left …", { n: left.length + 1 }));
       try {
-        const { ok, found } = await post("alarms/acknowledge", { alarm }, JSON.stringify({ by: operator(), raised }));
+        const { ok, refused, found } = await post("alarms/acknowledge", { alarm }, JSON.stringify({ by: operator(), raised }));
+        if (refused) left.length = 0; // the token was withdrawn
         if (!ok) wrong.push(`${alarm}: ${said(found.reason ?? found.error)}`);
         else {
           done.set(alarm, found);

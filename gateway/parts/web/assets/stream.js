@@ -95,7 +95,7 @@ export async function api(path, query = {}, options = {}) {
   });
   const text = plain(await reply.text());
   // The text of a value is kept as it was sent: a number of JavaScript would round it.
-  return { ok: reply.ok, found: JSON.parse(text.replace(/"value":(-?\d[\d.eE+-]*|\[[^\]"]*\])/g, '"value":"$1"')) };
+  return { ok: reply.ok, refused: reply.status === 401 || reply.status === 403, found: JSON.parse(text.replace(/"value":(-?\d[\d.eE+-]*|\[[^\]"]*\])/g, '"value":"$1"')) };
 }
 
 export const post = (path, query, body) =>
