@@ -19,10 +19,10 @@ from pyarrow import dataset, fs
 
 from gateway.archive.store import Cursor
 from gateway.archive.stores import store_at
+from tests.conftest import Command
 from tests.e2e.processes import (
     Program,
     gateway,
-    plc_gateway,
     started,
     until,
     vigor_line,
@@ -115,7 +115,9 @@ def have_all(store: Path, halls: list[Hall]) -> Callable[[], bool]:
     return check
 
 
-def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(tmp_path: Path) -> None:
+def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(
+    command: Command, tmp_path: Path
+) -> None:
     """Archivers take over from each other; a history is moved aside, and comes back."""
     endpoint, store = free_endpoint(), tmp_path / "archive"
     demo = Hall(tmp_path, "demo", endpoint, listen=[endpoint])
@@ -139,7 +141,7 @@ def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(tmp_path
     with demo.run(idle=True), other.run(idle=True), archiver(store, endpoint) as third:
         until(have_all(store, [demo, other]), "each sample is there once")
         assert third.end() == 0
-    [row, _] = map(json.loads, plc_gateway("archive", "status", store, "--json").out.splitlines())
+    [row, _] = map(json.loads, command("archive", "status", store, "--json").out.splitlines())
     assert row["samples"] == recorded(demo.history, "demo").total()
     assert (row["gateway"], row["gaps"]) == ("plant/@gateway/demo", [])
     assert row["behind"] < 3600
@@ -148,7 +150,7 @@ def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(tmp_path
     with demo.run() as running, archiver(store, endpoint) as fourth:
         fourth.says("its history is another file")
         assert (running.end(), fourth.end()) == (0, 0)
-    assert plc_gateway("history", "salvage", demo.folder / "c.yaml").code == 0
+    assert command("history", "salvage", demo.folder / "c.yaml").code == 0
     assert not aside.exists()
     with demo.run(idle=True), archiver(store, endpoint) as fifth:
         fifth.says("its history is another file")
@@ -158,7 +160,7 @@ def test_histories_of_two_gateways_are_in_parquet_once_whatever_happens(tmp_path
         f"SELECT DISTINCT origin, typeof(value) FROM '{store}/*/*/*.parquet'"  # noqa: S608
     ).fetchall()
     assert ("simulated", "DOUBLE") in rows
-    shown = plc_gateway("archive", "status", store)
+    shown = command("archive", "status", store)
     assert "plant/@gateway/other" in shown.out
     assert "its history is another file: samples may be missing" in shown.out
 
@@ -194,17 +196,19 @@ async def test_the_page_of_a_gateway_has_its_samples_only(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("option", [("--every", "0"), ("--rate", "0"), ("--rate", "x")])
-def test_wrong_options_are_refused(option: tuple[str, str], tmp_path: Path) -> None:
-    done = plc_gateway("archive", "run", tmp_path / "archive", *option)
+def test_wrong_options_are_refused(
+    command: Command, option: tuple[str, str], tmp_path: Path
+) -> None:
+    done = command("archive", "run", tmp_path / "archive", *option)
     assert done.code == 2
     assert option[0] in done.err
 
 
-def test_a_clock_that_was_ahead_hides_no_delay(tmp_path: Path) -> None:
+def test_a_clock_that_was_ahead_hides_no_delay(command: Command, tmp_path: Path) -> None:
     """It has noted a time of next year: nothing was `behind` until then."""
     store = store_at(str(tmp_path / "archive"))
     ahead = round((time.time() + 3e7) * 1e6)
     begun = Cursor("plant/@gateway/demo")
     store.add([], begun, replace(begun, after="demo:1f.a0-1-2", whole=ahead))
-    shown = plc_gateway("archive", "status", tmp_path / "archive", "--json")
+    shown = command("archive", "status", tmp_path / "archive", "--json")
     assert json.loads(shown.out)["behind"] is None

@@ -23,10 +23,10 @@ from gateway.cli.certificates.signing import Holder, Pair
 from gateway.contract.access.certificates import expires
 from gateway.contract.faults import faults
 from gateway.errors import ConfigError
+from tests.conftest import Command
 from tests.e2e.processes import (
     free_port,
     gateway,
-    plc_gateway,
     started,
     until,
     vigor_line,
@@ -57,7 +57,9 @@ def greets(port: int, folder: Path, called: str, *, refused: bool = False) -> No
             opened.recv(1)
 
 
-def test_gateway_and_clients_know_each_other_by_their_certificates(tmp_path: Path) -> None:
+def test_gateway_and_clients_know_each_other_by_their_certificates(
+    command: Command, tmp_path: Path
+) -> None:
     plant, other = tmp_path / "plant", tmp_path / "other"
     for folder in (plant, other):
         issued(folder, Holder("scada", is_client=True))
@@ -81,7 +83,7 @@ def test_gateway_and_clients_know_each_other_by_their_certificates(tmp_path: Pat
             greets(port, other, "gateway.plant", refused=True)
         # A session of Zenoh with the certificate of the client.
         file.write_text(file.read_text().replace("plant/gateway.", "plant/scada."))
-        health = plc_gateway("health", "--json", file)
+        health = command("health", "--json", file)
         assert json.loads(health.out)["name"] == "demo"
 
 
@@ -107,31 +109,35 @@ def _renew(pki: Path, days: int) -> None:
     issued(pki, Holder("gateway", ["127.0.0.1"]), days)
 
 
-def test_a_certificate_says_how_long_it_is_valid_and_is_renewed(tmp_path: Path) -> None:
+def test_a_certificate_says_how_long_it_is_valid_and_is_renewed(
+    command: Command, tmp_path: Path
+) -> None:
     file, pki = _plant(tmp_path, 12)
     said = f"zenoh.tls.certificate {pki / 'gateway.pem'} expires in 12 d: renew it"
-    checked = plc_gateway("check", file)
+    checked = command("check", file)
     assert said in " ".join((checked.out + checked.err).split())
     with started(file) as program:
-        status = plc_gateway("health", "--strict", file)
+        status = command("health", "--strict", file)
         assert said in status.err
         _renew(pki, 200)
         os.kill(program.pid, signal.SIGHUP)
         program.says("gateway outdated", "the files of zenoh.tls were renewed")
         program.says("gateway starts over")
-        until(lambda: said not in plc_gateway("health", "--strict", file).err, "it is renewed")
-        found = json.loads(plc_gateway("status", "--json", file).out)
+        until(lambda: said not in command("health", "--strict", file).err, "it is renewed")
+        found = json.loads(command("status", "--json", file).out)
         for setting in ("certificate", "lines.boiler.tls.certificate"):
             assert 199 < found[f"certificates/{setting}"]["days"] <= 200
 
 
-def test_files_that_do_not_fit_each_other_are_not_taken_over(tmp_path: Path) -> None:
+def test_files_that_do_not_fit_each_other_are_not_taken_over(
+    command: Command, tmp_path: Path
+) -> None:
     file, pki = _plant(tmp_path, 200)
     with started(file) as program:
         (pki / "gateway.key").write_bytes((pki / "ca.key").read_bytes())
         os.kill(program.pid, signal.SIGHUP)
         program.says("file reloaded")
-        assert plc_gateway("health", file).code == 0
+        assert command("health", file).code == 0
         assert not program.has_said("gateway starts over")
 
 

@@ -4,7 +4,8 @@ import json
 import urllib.request
 from pathlib import Path
 
-from tests.e2e.processes import free_port, plc_gateway, started, until, vigor_line, write_config
+from tests.conftest import Command
+from tests.e2e.processes import free_port, started, until, vigor_line, write_config
 from tests.northbound.access import secret
 from tests.zenoh_peer import free_endpoint
 
@@ -12,7 +13,7 @@ FILES = ("state.json", "state.held.json", "alarms.json", "writers.json")
 TAGS = {"speed": {"address": "D10", "alarm": {"high": 80}}}
 
 
-def test_each_damaged_file_is_a_fault_until_it_is_removed(tmp_path: Path) -> None:
+def test_each_damaged_file_is_a_fault_until_it_is_removed(command: Command, tmp_path: Path) -> None:
     """With `writers.json` the time until which signatures were accepted is lost."""
     secret(tmp_path / "writers.txt", "alice:" + "a" * 40 + "\n")
     limit = {"limit": {"address": "holding:0", "write": True}}
@@ -42,13 +43,13 @@ def test_each_damaged_file_is_a_fault_until_it_is_removed(tmp_path: Path) -> Non
             return str(line.split()[-1])
 
     def damaged() -> set[str]:
-        documents = json.loads(plc_gateway("status", "--json", file).out)
+        documents = json.loads(command("status", "--json", file).out)
         return {Path(one).name for one in documents["damaged"]["files"]}
 
     asides = {f"{name}.bad" for name in FILES}
     with started(file) as program:
         until(lambda: damaged() == asides, "each file is a fault")
-        done = plc_gateway("status", file)
+        done = command("status", file)
         assert done.code != 0
         assert all(f"{name} is a damaged file" in " ".join(done.out.split()) for name in asides)
         assert metric() == "4.0"

@@ -11,6 +11,7 @@ from pathlib import Path
 from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import good
 from tests.attacks.test_clock_of_signatures import run, set_clock
+from tests.conftest import Command
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.history.recorded import SECOND, store_run
 from tests.history_writer import tag
@@ -53,7 +54,9 @@ def speeds(exported: str) -> list[str]:
 EVERY = [str(n) for n in range(RUNS * IN_RUN)]
 
 
-async def test_a_clock_ten_years_ahead_for_a_moment_costs_no_sample(tmp_path: Path) -> None:
+async def test_a_clock_ten_years_ahead_for_a_moment_costs_no_sample(
+    command: Command, tmp_path: Path
+) -> None:
     file = plant(tmp_path, endpoint := free_endpoint())
     with await asyncio.to_thread(run, file, YEARS) as program:
         async with ZenohPeer("client", connect=[endpoint]) as client:
@@ -62,7 +65,7 @@ async def test_a_clock_ten_years_ahead_for_a_moment_costs_no_sample(tmp_path: Pa
             set_clock(tmp_path, program, 0)
             await client.get_until(DOCUMENT, lambda one: one["stored"] > ahead["stored"] + 10)
         assert await asyncio.to_thread(program.end) == 0
-    assert speeds(plc_gateway(*EXPORT, file).out) == EVERY
+    assert speeds(command(*EXPORT, file).out) == EVERY
 
 
 async def moved_aside(file: Path, endpoint: str) -> int:
@@ -77,20 +80,22 @@ async def moved_aside(file: Path, endpoint: str) -> int:
     return len(found["aside"])
 
 
-async def test_a_damaged_history_is_a_fault_until_its_samples_are_back(tmp_path: Path) -> None:
+async def test_a_damaged_history_is_a_fault_until_its_samples_are_back(
+    command: Command, tmp_path: Path
+) -> None:
     file = plant(tmp_path, endpoint := free_endpoint())
     with (path := tmp_path / "history.db").open("r+b") as first_page:
         first_page.write(b"\xa5" * 4096)
     assert await moved_aside(file, endpoint) == 1
-    assert speeds(plc_gateway(*EXPORT, file).out) == []
+    assert speeds(command(*EXPORT, file).out) == []
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE file SET oldest = 9223372036854775807")
     assert await moved_aside(file, endpoint) == 2
-    done = plc_gateway("history", "salvage", file)
+    done = command("history", "salvage", file)
     assert (done.code, "samples are back" in done.err) == (0, True)
     assert await moved_aside(file, endpoint) == 0
     (tmp_path / "rows.csv").symlink_to(tmp_path / "of another user")
-    exported = plc_gateway(*EXPORT, file, "--output", tmp_path / "rows.csv")
+    exported = command(*EXPORT, file, "--output", tmp_path / "rows.csv")
     assert (exported.code, (tmp_path / "of another user").exists()) == (0, False)
     rows = (tmp_path / "rows.csv").read_text()
     assert speeds(rows) == EVERY

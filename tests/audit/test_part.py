@@ -11,7 +11,8 @@ import pytest
 from gateway.parts.audit import part
 from gateway.parts.audit.file import checked, read
 from gateway.parts.audit.part import AuditPart
-from tests.e2e.processes import plc_gateway, started, until, vigor_line, write_config
+from tests.conftest import Command
+from tests.e2e.processes import started, until, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
@@ -67,7 +68,9 @@ async def asked_by_time(client: ZenohPeer, path: Path) -> None:
     assert refused.json["error"] == "unknown-tag"
 
 
-async def test_writes_and_acknowledgements_are_there_after_a_kill(tmp_path: Path) -> None:
+async def test_writes_and_acknowledgements_are_there_after_a_kill(
+    command: Command, tmp_path: Path
+) -> None:
     endpoint, path = free_endpoint(), tmp_path / "audit.jsonl"
     tags = {
         "speed": {"address": "D10", "write": True},
@@ -98,9 +101,9 @@ async def test_writes_and_acknowledgements_are_there_after_a_kill(tmp_path: Path
     assert [one["value"] for one in found if one.get("outcome") == "written"] == list(range(5))
     assert [one["event"] for one in found if "event" in one] == ["begins", "acknowledged"]
     assert len([one for one in found if one.get("outcome") == "not-writable"]) == 1
-    printed = plc_gateway("audit", file)
+    printed = command("audit", file)
     assert (printed.code, len(printed.out.splitlines())) == (0, len(found))
-    assert plc_gateway("audit", file, "--time", "[..2020-01-01T00:00:00Z]").out == ""
+    assert command("audit", file, "--time", "[..2020-01-01T00:00:00Z]").out == ""
     path.write_bytes(path.read_bytes().replace(b'"value":3', b'"value":2'))
-    changed = plc_gateway("audit", file)
+    changed = command("audit", file)
     assert (changed.code, "was changed: record" in changed.err) == (1, True)

@@ -1,16 +1,14 @@
 """Fixtures of the commands: run in this process, and gateways to talk to."""
 
 import json
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gateway.cli.main import main
 from gateway.config import load
-from tests.e2e.processes import Done, plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import plc_gateway, started, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 TAGS = {
@@ -22,24 +20,6 @@ TAGS = {
     "name": {"address": "D600", "type": "string[128]", "every": "5s", "write": True},
     "level": {"address": "D700", "type": "float32", "write": True},
 }
-Command = Callable[..., Done]
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """`plc-gateway` in this process, for commands that start nothing."""
-
-    def run(*arguments: object) -> Done:
-        monkeypatch.setattr(sys, "argv", ["plc-gateway", *map(str, arguments)])
-        try:
-            main()
-            code: Any = 0
-        except SystemExit as end:
-            code = end.code or 0
-        out, err = capsys.readouterr()
-        return Done(code, out, err)
-
-    return run
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from gateway.cli.alarms import past_view
-from tests.cli.conftest import Command
+from tests.conftest import Command
 
 
 def test_an_alarm_is_shelved_listed_and_put_back(running: Path, command: Command) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from gateway.config import load
-from tests.cli.conftest import Command, documents
+from tests.cli.conftest import documents
+from tests.conftest import Command
 from tests.e2e.processes import gateway, vigor_line
 from tests.zenoh_peer import free_port
 

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from gateway.cli.config.check import seconds
-from tests.cli.conftest import TAGS, Command
+from tests.cli.conftest import TAGS
+from tests.conftest import Command
 from tests.e2e.processes import plc_gateway, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 

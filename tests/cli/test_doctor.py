@@ -6,8 +6,8 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from tests.cli.conftest import Command
-from tests.e2e.processes import free_port, plc_gateway, vigor_line, write_config
+from tests.conftest import Command
+from tests.e2e.processes import free_port, vigor_line, write_config
 from tests.transport.authority import DAY, Authority
 from tests.transport.ends import PtyMaster
 from tests.transport.test_tls import foreign_server, serving
@@ -96,7 +96,7 @@ def test_a_history_larger_than_the_disk_is_said(command: Command, tmp_path: Path
 
 
 def test_a_running_gateway_keeps_its_ports(command: Command, running: Path) -> None:
-    done = plc_gateway("doctor", running)
+    done = command("doctor", running)
     assert done.code == 0, done
     assert "runs, version" in done.out
     assert f"good  {running}" in done.out

@@ -18,7 +18,7 @@ from gateway.config.loading import dumped
 from gateway.contract.documents.fleet import ReportDocument
 from gateway.contract.fleet_files import Wanted, wanted_in
 from gateway.contract.fleet_rows import State, Told, rows, told_by
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.e2e.processes import free_port, plc_gateway, started, until, write_config
 from tests.northbound.access import PASSWORDS, ROUTER_RULES, rules, users
 from tests.zenoh_peer import configured, free_endpoint

@@ -12,7 +12,7 @@ import pytest
 from gateway.cli.history.history_files import Column, write_csv
 from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import Reason, bad, good
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.e2e.processes import vigor_line, write_config
 from tests.history.recorded import NOON, SECOND, store_run
 from tests.history_writer import tag

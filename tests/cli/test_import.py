@@ -13,7 +13,7 @@ from gateway.cli.sheets.import_command import _meaning
 from gateway.config import load
 from gateway.config.yaml.insert import with_tags, written
 from gateway.errors import ConfigError
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.e2e.processes import ROOT
 from tests.sheets import plant
 

@@ -13,7 +13,7 @@ from gateway.config.sheets import read_grid, read_sheet, workbooks
 from gateway.errors import ConfigError
 from gateway.stations.registry import station_of
 from gateway.values import Value
-from tests.cli.conftest import Command
+from tests.conftest import Command
 
 FOREIGN = Path(__file__).with_name("foreign")
 VIGOR = """\

@@ -9,7 +9,8 @@ import pytest
 from gateway.contract.documents.catalogue import FILE
 from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import good
-from tests.cli.conftest import Command, documents
+from tests.cli.conftest import documents
+from tests.conftest import Command
 from tests.contract.reader import Reader
 from tests.e2e.processes import vigor_line, write_config
 from tests.e2e.test_served_recording import LOG

@@ -16,9 +16,10 @@ from gateway.cli.examples import EXAMPLES
 from gateway.cli.main import cli
 from gateway.config import schema as config_schema
 from gateway.contract.documents.catalogue import FILE
-from tests.cli.conftest import Command, documents
+from tests.cli.conftest import documents
+from tests.conftest import Command
 from tests.contract.reader import Reader
-from tests.e2e.processes import Done, plc_gateway
+from tests.e2e.processes import Done
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = str(ROOT / "config.example.yaml")
@@ -219,16 +220,16 @@ def test_status_and_health_import_no_protocol(running: Path) -> None:
 
 
 def test_a_mistake_elsewhere_in_the_file_does_not_hide_the_running_gateway(
-    running: Path, tmp_path: Path
+    command: Command, running: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(running.read_text().replace('"D500"', '"D50O"'))
-    assert plc_gateway("check", path).code == 2
-    assert plc_gateway("health", path).code == 0
+    assert command("check", path).code == 2
+    assert command("health", path).code == 0
 
 
-def test_health_prints_the_status(running: Path) -> None:
-    assert plc_gateway("health", running).out.endswith(": it answers\n")
-    done = plc_gateway("health", "--json", running)
+def test_health_prints_the_status(command: Command, running: Path) -> None:
+    assert command("health", running).out.endswith(": it answers\n")
+    done = command("health", "--json", running)
     assert done.code == 0
     assert json.loads(done.out)["devices"] == {"mixer": "up"}

@@ -10,8 +10,7 @@ from gateway.config.sheets import cells
 from gateway.contract.keys import max_age
 from gateway.contract.past.timerange import time_range
 from gateway.errors import ConfigError
-from tests.cli.conftest import Command
-from tests.e2e.processes import plc_gateway
+from tests.conftest import Command
 
 
 def refused(folder: Path, line: str) -> str:
@@ -185,7 +184,9 @@ def test_check_strict_fails_on_an_overloaded_line(command: Command, tmp_path: Pa
 
 
 @pytest.mark.parametrize(("word", "value"), [("on", "true"), ("OFF", "false")])
-def test_a_bit_is_written_as_on_and_off(running: Path, word: str, value: str) -> None:
-    done = plc_gateway("write", running, "mixer/run", word)
+def test_a_bit_is_written_as_on_and_off(
+    command: Command, running: Path, word: str, value: str
+) -> None:
+    done = command("write", running, "mixer/run", word)
     assert (done.code, done.out.split(":")[0]) == (0, f"mixer/run = {value}")
-    assert plc_gateway("write", running, "mixer/name", word).out.startswith(f"mixer/name = {word}")
+    assert command("write", running, "mixer/name", word).out.startswith(f"mixer/name = {word}")

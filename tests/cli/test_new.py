@@ -12,7 +12,7 @@ from gateway.config import load
 from gateway.protocols.modbus import ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.transport import SerialSettings
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.e2e.processes import PATIENCE, station
 from tests.e2e.test_first_plant import three_free_ports
 

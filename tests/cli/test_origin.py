@@ -20,7 +20,7 @@ from gateway.engine.device.device import Device
 from gateway.engine.jobs.requests import Write
 from gateway.engine.results.request_rules import result_of
 from gateway.tags import Reason, Tag, bad, good
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.history.recorded import EVERYTHING, NOON, history
 
 FILE = """

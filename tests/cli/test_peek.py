@@ -15,7 +15,7 @@ from gateway.protocols.ranges import addresses
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Reason, bad, good
 from gateway.values import Order
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.e2e.processes import plc_gateway
 
 OPTIONS = {"port": "simulator", "protocol": "vigor", "station": 1, "baudrate": None, "format": None}

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import TAGS, Command, documents
-from tests.e2e.processes import plc_gateway
+from tests.cli.conftest import TAGS, documents
+from tests.conftest import Command
 
 
 @pytest.mark.parametrize("name", ["read", "watch"])
@@ -36,8 +36,8 @@ def test_a_max_age_that_is_not_a_duration_ends_with_2(command: Command, config: 
     assert "max_age=soon is no duration" in done.err
 
 
-def test_read_prints_a_table(running: Path) -> None:
-    done = plc_gateway("read", running)
+def test_read_prints_a_table(command: Command, running: Path) -> None:
+    done = command("read", running)
     assert done.code == 0
     header, *rows = done.out.splitlines()
     assert header.split() == ["tag", "value", "unit", "quality", "time"]
@@ -47,13 +47,13 @@ def test_read_prints_a_table(running: Path) -> None:
     ]
 
 
-def test_read_as_json_prints_one_document_per_line(running: Path) -> None:
+def test_read_as_json_prints_one_document_per_line(command: Command, running: Path) -> None:
     text = "x" * 128  # a line longer than any terminal
-    assert plc_gateway("write", running, "mixer/name", text).code == 0
+    assert command("write", running, "mixer/name", text).code == 0
     asked = ("read", running, "mixer/name", "mixer/run", "--json", "--max-age", "0s")
-    done = plc_gateway(*asked)
+    done = command(*asked)
     while done.code and "no-reply" in done.out:  # a simulated reply is late on a busy machine
-        done = plc_gateway(*asked)
+        done = command(*asked)
     assert done.code == 0, done
     name, run = documents(done.out)
     assert (name["tag"], name["value"], name["quality"]) == ("mixer/name", text, "good")
@@ -61,8 +61,10 @@ def test_read_as_json_prints_one_document_per_line(running: Path) -> None:
 
 
 @pytest.mark.parametrize("tags", [[], ["mixer"], ["mixer/run", "mixer/new"]])
-def test_read_names_tags_without_a_reply_and_ends_with_1(newer: Path, tags: list[str]) -> None:
-    done = plc_gateway("read", newer, *tags, "--json")
+def test_read_names_tags_without_a_reply_and_ends_with_1(
+    command: Command, newer: Path, tags: list[str]
+) -> None:
+    done = command("read", newer, *tags, "--json")
     assert done.code == 1
     assert "mixer/run" in [row["tag"] for row in documents(done.out)]
     assert done.err == (

@@ -15,7 +15,7 @@ from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
 from gateway.transport import Port, Receiver, SerialSettings
-from tests.cli.conftest import Command
+from tests.conftest import Command
 from tests.protocols.test_swapped import over_swapped_wires
 from tests.sim.virtual import on_virtual_time
 

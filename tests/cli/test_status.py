@@ -16,6 +16,7 @@ from rich.console import Console
 from gateway.cli.status import view
 from gateway.contract.faults import faults, warnings
 from gateway.contract.line_faults import span
+from tests.conftest import Command
 from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
 from tests.web.serving import calling, transfer
 from tests.zenoh_peer import free_endpoint
@@ -28,15 +29,15 @@ def device_on(port: str, name: str) -> dict[str, Any]:
     return {**line, "devices": {name: line["devices"]["mixer"]}}
 
 
-def until_exit(code: int, *arguments: object) -> Done:
+def until_exit(command: Command, code: int, *arguments: object) -> Done:
     """Runs a command until it ends with this code; the test's own time-out bounds it."""
-    while (done := plc_gateway(*arguments)).code != code:
+    while (done := command(*arguments)).code != code:
         pass
     return done
 
 
-def test_a_healthy_gateway(running: Path) -> None:
-    done = plc_gateway("status", running)
+def test_a_healthy_gateway(command: Command, running: Path) -> None:
+    done = command("status", running)
     assert (done.code, done.err) == (0, "")
     assert re.search(r"^demo \S+, up \d+ (s|min), 7 tags$", done.out, re.MULTILINE)
     assert re.search(r"^hall +simulated +\d", done.out, re.MULTILINE)
@@ -44,17 +45,17 @@ def test_a_healthy_gateway(running: Path) -> None:
     assert re.search(r"^Zenoh +\d client", done.out, re.MULTILINE)
     assert re.search(r"^history +not kept", done.out, re.MULTILINE)
     assert "wrong" not in done.out
-    assert plc_gateway("health", "--strict", running).code == 0
+    assert command("health", "--strict", running).code == 0
 
 
-def test_as_json_it_is_every_document(running: Path) -> None:
-    documents = json.loads(plc_gateway("status", "--json", running).out)
+def test_as_json_it_is_every_document(command: Command, running: Path) -> None:
+    documents = json.loads(command("status", "--json", running).out)
     assert documents["status"]["devices"] == {"mixer": "up"}
     assert documents["lines/hall"]["open"] is True
     assert documents["devices/mixer"]["station"] == 1
 
 
-def test_what_is_wrong_is_said_and_fails(tmp_path: Path) -> None:
+def test_what_is_wrong_is_said_and_fails(command: Command, tmp_path: Path) -> None:
     with ExitStack() as stack:
         deaf = stack.enter_context(socket.create_server(("127.0.0.1", 0)))  # accepts, says nothing
         lines = {
@@ -66,17 +67,17 @@ def test_what_is_wrong_is_said_and_fails(tmp_path: Path) -> None:
         config = write_config(tmp_path / "c.yaml", free_endpoint(), lines, history=history)
         program = stack.enter_context(started(config))
         program.says("device offline", "pump")
-        until_exit(0, "write", config, "mixer/trim", "5")
-        done = until_exit(1, "status", config)
+        until_exit(command, 0, "write", config, "mixer/trim", "5")
+        done = until_exit(command, 1, "status", config)
         assert f"line yard is down: {tmp_path / 'no-port'}: no such port" in done.out
         assert re.search(r"pump is silent: .*power", done.out)
         assert "oven" not in done.out[done.out.index("wrong:") :]  # its line says why
         assert re.search(r"^writes +1 written in the last hour", done.out, re.MULTILINE)
-        strict = plc_gateway("health", "--strict", "--json", config)
+        strict = command("health", "--strict", "--json", config)
         assert strict.code == 1
         assert json.loads(strict.out)["devices"]["mixer"] == "up"
         assert strict.err.splitlines()[0].startswith("line yard is down:")
-        assert plc_gateway("health", config).code == 0  # it is there
+        assert command("health", config).code == 0  # it is there
 
 
 def test_watch_follows_and_shows_a_gateway_that_has_gone(tmp_path: Path) -> None:

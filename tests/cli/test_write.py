@@ -10,8 +10,9 @@ from gateway.cli.client import connected
 from gateway.cli.write import outcome
 from gateway.config import load
 from gateway.errors import GatewayError
-from tests.cli.conftest import TAGS, Command, documents
-from tests.e2e.processes import plc_gateway, started, until, vigor_line, write_config
+from tests.cli.conftest import TAGS, documents
+from tests.conftest import Command
+from tests.e2e.processes import started, until, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 
@@ -50,50 +51,48 @@ def test_an_impossible_write_ends_with_2(
     ],
 )
 def test_write_prints_the_reply_of_the_plc(
-    running: Path, tag: str, typed: str, value: str, how: str
+    command: Command, running: Path, tag: str, typed: str, value: str, how: str
 ) -> None:
-    done = plc_gateway("write", running, tag, typed)
+    done = command("write", running, tag, typed)
     assert (done.code, done.err) == (0, "")
     assert done.out.startswith(f"{tag} = {value}: {how} (simulated), ")
     assert done.out.endswith(" ms\n")
 
     def is_read() -> bool:  # a slow machine may miss a reply
-        [row] = documents(plc_gateway("read", running, tag, "--json", "--max-age", "0s").out)
+        [row] = documents(command("read", running, tag, "--json", "--max-age", "0s").out)
         return str(row["value"]) == value.replace("true", "True")
 
     until(is_read, f"{tag} is {value}")
 
 
-def test_write_as_json(running: Path) -> None:
-    done = plc_gateway("write", running, "mixer/trim", "-5", "--json")
+def test_write_as_json(command: Command, running: Path) -> None:
+    done = command("write", running, "mixer/trim", "-5", "--json")
     [answer] = documents(done.out)
     assert (done.code, answer["value"], answer["verified"]) == (0, -5, True)
     assert set(answer) == {"value", "time", "verified", "acknowledged", "took", "origin"}
 
 
-def test_a_write_to_a_tag_unknown_to_the_gateway_ends_with_2(newer: Path) -> None:
-    done = plc_gateway("write", newer, "mixer/new", "1")
+def test_a_write_to_a_tag_unknown_to_the_gateway_ends_with_2(command: Command, newer: Path) -> None:
+    done = command("write", newer, "mixer/new", "1")
     assert (done.code, done.out) == (2, "")
     assert done.err.startswith("mixer/new: unknown-tag: there is no tag at plant/mixer/new")
-    done = plc_gateway("read", newer, "mixer/new")
+    done = command("read", newer, "mixer/new")
     assert done.code == 1
     assert "no reply: is the gateway of this file running?" in done.err
 
 
-def test_a_gateway_that_hangs_does_not_get_the_write(
-    tmp_path: Path,
-) -> None:
+def test_a_gateway_that_hangs_does_not_get_the_write(command: Command, tmp_path: Path) -> None:
     lines = {"hall": vigor_line("simulator", TAGS)}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
     with started(path) as program:
         program.says("device online")
-        assert plc_gateway("write", path, "mixer/trim", "1").code == 0
+        assert command("write", path, "mixer/trim", "1").code == 0
         with connected(load(path), print) as client:
             os.kill(program.pid, signal.SIGSTOP)
             with pytest.raises(GatewayError, match="nothing was sent"):
                 client.requests.write("mixer/trim", 2)
         os.kill(program.pid, signal.SIGCONT)
-        while (read := plc_gateway("read", path, "mixer/trim", "--json", "--max-age", "0s")).code:
+        while (read := command("read", path, "mixer/trim", "--json", "--max-age", "0s")).code:
             pass  # it goes on
         assert [row["value"] for row in documents(read.out)] == [1]
 

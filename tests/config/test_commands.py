@@ -13,6 +13,7 @@ from gateway.config.commands import NotControlled, check_command, speaker
 from gateway.contract.keys import Keys
 from gateway.errors import BadValue, ConfigError, LineDown
 from gateway.plant.plant import Plant
+from tests.conftest import Command
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -157,9 +158,9 @@ async def test_over_zenoh(served: tuple[str, Path]) -> None:
     ],
 )
 def test_by_hand(
-    served: tuple[str, Path], arguments: tuple[str, ...], code: int, says: str
+    command: Command, served: tuple[str, Path], arguments: tuple[str, ...], code: int, says: str
 ) -> None:
-    done = plc_gateway("control", served[1], *arguments)
+    done = command("control", served[1], *arguments)
     assert done.code == code, done
     assert says in (done.out if code == 0 else done.err)
 

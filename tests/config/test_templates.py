@@ -20,10 +20,8 @@ from gateway.config.whole import whole_text
 from gateway.config.yaml.file import YamlFile, read_yaml
 from gateway.errors import ConfigError
 from gateway.tags import Tag
-from tests.cli.conftest import Command, command
 from tests.config import manual_tables as manual
-
-__all__ = ["command"]  # a fixture
+from tests.conftest import Command
 
 HEAD = """\
 lines:

@@ -16,6 +16,7 @@ from gateway.contract.documents.introspection import introspection
 from gateway.contract.keys import CONTRACT, Keys
 from gateway.contract.meta import meta
 from gateway.tags.tag import WriteRule
+from tests.conftest import Command
 from tests.contract.faulty_plant import (
     QUERIES,
     REQUESTS,
@@ -26,9 +27,6 @@ from tests.contract.faulty_plant import (
     subscribed,
 )
 from tests.contract.reader import Reader
-from tests.e2e.processes import (
-    plc_gateway,
-)
 from tests.northbound.plant import PlainDevice
 from tests.northbound.plant import tag as tag_of
 from tests.zenoh_peer import TIMEOUT, ZenohPeer
@@ -120,8 +118,8 @@ def test_a_gateway_says_what_it_permits() -> None:
     assert Reader(COMMITTED, "plant").violations("introspection", told) == []
 
 
-def test_the_command_prints_the_schemas() -> None:
-    assert json.loads(plc_gateway("schema", "--contract").out) == COMMITTED
+def test_the_command_prints_the_schemas(command: Command) -> None:
+    assert json.loads(command("schema", "--contract").out) == COMMITTED
 
 
 # -- a running plant -------------------------------------------------------------------------------

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.conftest import needs
-from tests.e2e.processes import Program, cable, plc_gateway, started, until, write_config
+from tests.conftest import Command, needs
+from tests.e2e.processes import Program, cable, started, until, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {
@@ -129,7 +129,7 @@ async def test_a_bad_address_and_an_offline_plc(oven: Oven) -> None:
         await heard.next(lambda s: s.json.get("value") == 21.5, timeout=20)
 
 
-async def test_control(oven: Oven) -> None:
+async def test_control(command: Command, oven: Oven) -> None:
     async with ZenohPeer("client", connect=[oven.endpoint]) as client:
         heard = await client.subscribe("plant/oven/*")
         oven.plc.tell("set D0100 215")
@@ -138,22 +138,22 @@ async def test_control(oven: Oven) -> None:
         assert model.json["answer"] == "9D (FX2N)"
         [loopback] = await client.get("plant/oven/@loopback", b"HELLO")
         assert loopback.json["answer"] == "HELLO"
-        for command in ("run", "stop"):
-            [reply] = await client.get(f"plant/oven/@{command}")
+        for name in ("run", "stop"):
+            [reply] = await client.get(f"plant/oven/@{name}")
             assert reply.json["answer"] == "acknowledged"
         [sent] = await client.get("plant/@gateway/demo/lines/hall/global", b"on")
         assert "none answers" in sent.json["answer"]
         until(lambda: oven.plc.tell("get M8126") == "1", "the flag changes")
     oven.gateway.says("command executed", "@stop")
-    done = plc_gateway("control", oven.config, "oven", "loopback", "HI")
+    done = command("control", oven.config, "oven", "loopback", "HI")
     assert (done.code, done.out) == (0, "HI\n")
-    done = plc_gateway("control", oven.config, "oven", "global", "off")
+    done = command("control", oven.config, "oven", "global", "off")
     assert done.code == 0
     until(lambda: oven.plc.tell("get M8126") == "0", "the flag changes")
-    done = plc_gateway("control", oven.config, "oven", "loopback", "HI", "--json")
+    done = command("control", oven.config, "oven", "loopback", "HI", "--json")
     assert (done.code, {*json.loads(done.out)}) == (0, {"answer", "time", "took"})
     oven.plc.tell("mute")
-    done = plc_gateway("control", oven.config, "oven", "model", "--json")
+    done = command("control", oven.config, "oven", "model", "--json")
     assert (done.code, json.loads(done.out)["error"]) == (1, "no-reply")
 
 

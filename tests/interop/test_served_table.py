@@ -9,6 +9,7 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient
 
 from tests.attacks.test_served_lines import Wire
+from tests.conftest import Command
 from tests.e2e.processes import Program, plc_gateway, started
 from tests.interop.peers import pty_pair
 from tests.serving.easy_link import EXAMPLE, EasyLink
@@ -107,28 +108,30 @@ async def test_a_modbus_master_reads_and_writes_the_gateway_by_its_mbus_table(
         (LINK.replace("D10,", "Q10,"), 5, "Q10: there is no device Q"),
     ],
 )
-def test_a_mistake_prints_no_line(tmp_path: Path, table: str, station: int, said: str) -> None:
+def test_a_mistake_prints_no_line(
+    command: Command, tmp_path: Path, table: str, station: int, said: str
+) -> None:
     sheet = tmp_path / "table.csv"
     sheet.write_text(table)
-    done = plc_gateway("import", sheet, "--serve", station)
+    done = command("import", sheet, "--serve", station)
     assert (done.code, done.out) == (2, "")
     assert said in done.err
 
 
-def test_an_option_that_would_be_ignored_is_refused(tmp_path: Path) -> None:
+def test_an_option_that_would_be_ignored_is_refused(command: Command, tmp_path: Path) -> None:
     (sheet := tmp_path / "table.csv").write_text(LINK)
     for more in (("--into", "plant.yaml"), ("--device", "x"), ("--transfers", "plc")):
-        done = plc_gateway("import", sheet, "--serve", 5, *more)
+        done = command("import", sheet, "--serve", 5, *more)
         assert (done.code, done.out) == (2, "")
         assert "leave out --into" in done.err
 
 
-def test_a_word_that_is_read_and_written_is_the_masters(tmp_path: Path) -> None:
+def test_a_word_that_is_read_and_written_is_the_masters(command: Command, tmp_path: Path) -> None:
     sheet = tmp_path / "table.csv"
     sheet.write_text(
         "Command,Master Data,Slave ID,Slave Data,Length\nRead,D0,1,D5,2\nWrite,D9,1,D6,1\n"
     )
-    done = plc_gateway("import", sheet, "--serve", 1)
+    done = command("import", sheet, "--serve", 1)
     device = yaml.safe_load(done.out)["lines"]["master-plc"]["devices"]["station-1"]
     assert device["accept"] == ["D6"]
     assert {name: "write" in tag for name, tag in device["tags"].items()} == {

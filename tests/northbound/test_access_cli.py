@@ -8,12 +8,13 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pytest
 
 from gateway.cli.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
-from tests.e2e.processes import PATIENCE, Done, plc_gateway, started, vigor_line, write_config
+from tests.conftest import Command
+from tests.e2e.processes import PATIENCE, Done, started, vigor_line, write_config
 from tests.northbound.access import (
     GATEWAY_RULES,
     PASSWORDS,
@@ -27,22 +28,33 @@ from tests.zenoh_peer import free_endpoint
 TAGS = {"speed": {"address": "D100"}, "recipe": {"address": "D500", "write": True}}
 
 
-def typed(user: str | None, *arguments: object, password: str | None = None) -> Done:
-    """Runs `plc-gateway ...` as a user, or without one. `watch` ends after one line."""
-    known = {}
-    if user is not None:
-        known = {USER_VARIABLE: user, PASSWORD_VARIABLE: password or PASSWORDS[user]}
-    command = f"{sys.executable} -m gateway {' '.join(map(str, arguments))}"
-    done = subprocess.run(
-        ["sh", "-c", f"{command} | head -n 1" if arguments[0] == "watch" else command],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        env={**os.environ, **known},
-        check=False,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return Done(done.returncode, done.stdout, done.stderr)
+class Typed(Protocol):
+    def __call__(self, user: str | None, *arguments: object, password: str = "") -> Done: ...
+
+
+@pytest.fixture
+def typed(command: Command) -> Typed:
+    """`plc-gateway ...` as a user, or without one."""
+
+    def run(user: str | None, *arguments: object, password: str = "") -> Done:
+        done: Done = command(*arguments, env=known(user, password))
+        return done
+
+    return run
+
+
+def known(user: str | None, password: str = "") -> dict[str, str]:
+    """Returns the variables of a user."""
+    if user is None:
+        return {}
+    return {USER_VARIABLE: user, PASSWORD_VARIABLE: password or PASSWORDS[user]}
+
+
+def watched(user: str, path: Path) -> str:
+    """Returns the first line of `watch` as a user."""
+    command = f"{sys.executable} -m gateway watch {path} --json | head -n 1"
+    env = {**os.environ, **known(user)}
+    return subprocess.check_output(["sh", "-c", command], env=env, text=True, timeout=PATIENCE)
 
 
 def plant_file(folder: Path, **zenoh_settings: Any) -> Path:
@@ -108,12 +120,12 @@ def closed_by_a_router(folder: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("closed", [closed_by_itself, closed_by_a_router])
 def test_the_command_line_has_the_rights_of_its_user(
-    closed: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
+    typed: Typed, closed: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
 ) -> None:
     with closed(tmp_path) as path:
         while typed("viewer", "read", path).code:
             pass  # the first values are on their way
-        assert json.loads(typed("viewer", "watch", path, "--json").out)["quality"] == "good"
+        assert json.loads(watched("viewer", path))["quality"] == "good"
         assert typed("operator", "write", path, "mixer/recipe", "7").code == 0
         done = typed("operator", "read", path, "mixer/recipe", "--json", "--max-age", "0s")
         assert (done.code, json.loads(done.out)["value"]) == (0, 7)
@@ -132,22 +144,24 @@ def test_the_command_line_has_the_rights_of_its_user(
         assert len(done.err.splitlines()) == 1
 
 
-def test_without_a_user_the_command_line_names_the_variables_to_set(tmp_path: Path) -> None:
+def test_without_a_user_the_command_line_names_the_variables_to_set(
+    typed: Typed, tmp_path: Path
+) -> None:
     with closed_by_itself(tmp_path) as path:
-        for command in ("read", "health"):
-            done = typed(None, command, path)
+        for name in ("read", "health"):
+            done = typed(None, name, path)
             assert (done.code, done.out) == (1, "")
             assert "requires a name and password" in done.err
             assert f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}" in done.err
 
 
-def test_a_gateway_that_stands_still_is_called_that(tmp_path: Path) -> None:
+def test_a_gateway_that_stands_still_is_called_that(command: Command, tmp_path: Path) -> None:
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D1"}})}
     file = write_config(tmp_path / "c.yaml", free_endpoint(), lines)
     with started(file) as program:
         os.kill(program.pid, signal.SIGSTOP)
         try:
-            done = plc_gateway("health", file)
+            done = command("health", file)
         finally:
             os.kill(program.pid, signal.SIGCONT)
         assert (done.code, done.out) == (1, "")
@@ -155,6 +169,7 @@ def test_a_gateway_that_stands_still_is_called_that(tmp_path: Path) -> None:
 
 
 def test_at_a_router_the_user_of_the_gateway_may_check_its_health_only(
+    typed: Typed,
     tmp_path: Path,
 ) -> None:
     with closed_by_a_router(tmp_path) as path:
@@ -166,13 +181,16 @@ def test_at_a_router_the_user_of_the_gateway_may_check_its_health_only(
         assert "may gateway query it?" in done.err
 
 
-def test_without_mutual_tls_the_command_line_does_not_read_the_private_key(tmp_path: Path) -> None:
+def test_without_mutual_tls_the_command_line_does_not_read_the_private_key(
+    typed: Typed, tmp_path: Path
+) -> None:
     with closed_by_itself(tmp_path) as path:
         (tmp_path / "gateway.key").write_text("not for the command line")
         assert typed("operator", "health", path).code == 0
 
 
 def test_a_certificate_for_another_address_is_named_as_the_reason(
+    typed: Typed,
     tmp_path: Path,
 ) -> None:
     certificate, key = certificates(tmp_path)("gateway", "DNS:gateway.plant")
@@ -188,7 +206,7 @@ def test_a_certificate_for_another_address_is_named_as_the_reason(
 
 @pytest.mark.parametrize("given", [USER_VARIABLE, PASSWORD_VARIABLE])
 def test_a_user_without_a_password_is_a_mistake_and_so_is_the_reverse(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+    typed: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
 ) -> None:
     monkeypatch.setenv(given, "operator")
     done = typed(None, "read", plant_file(tmp_path, listen=[free_endpoint()]))

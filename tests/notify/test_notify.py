@@ -14,14 +14,17 @@ from gateway.parts.notify.message import Message, message
 from gateway.parts.notify.outbox import Outbox
 from gateway.parts.notify.watch import TEST
 from gateway.stations.vigor import VigorStation
-from tests.e2e.processes import free_port, plc_gateway, started, until, write_config
+from tests.conftest import Command
+from tests.e2e.processes import free_port, started, until, write_config
 from tests.e2e.pty_modem import PATIENCE, PtyModem
 from tests.notify.test_ways import Mailbox, mail_server
 from tests.transport.modem import ModemModel
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
-def test_a_message_survives_a_dead_server_and_a_killed_gateway(tmp_path: Path) -> None:
+def test_a_message_survives_a_dead_server_and_a_killed_gateway(
+    command: Command, tmp_path: Path
+) -> None:
     box, port = Mailbox(), free_port()
     tag = {"address": "D10", "write": True, "alarm": {"high": 30_000, "text": "Tank full"}}
     device = {"protocol": "vigor", "station": 1, "tags": {"level": tag}}
@@ -40,23 +43,23 @@ def test_a_message_survives_a_dead_server_and_a_killed_gateway(tmp_path: Path) -
         },
     )
     with started(config) as gateway:
-        assert plc_gateway("write", config, "mixer/level", "30001").code == 0
+        assert command("write", config, "mixer/level", "30001").code == 0
         gateway.says("alarm message not sent", "refused")
         until(lambda: "waiting" in _saved(config), "the message is saved")
-        told = plc_gateway("status", config)
+        told = command("status", config)
         assert told.code == 1
         assert "mail does not work: connection refused; messages about alarms: 1" in told.out
         gateway.end(signal.SIGKILL)
     with mail_server(box, port=port), started(config) as gateway:
         gateway.says("alarm message sent", "mixer/level (simulated) raised: Tank full")
-        assert plc_gateway("status", config).code == 0
-        assert plc_gateway("write", config, "mixer/level", "1").code == 0
+        assert command("status", config).code == 0
+        assert command("write", config, "mixer/level", "1").code == 0
         gateway.says("alarm message sent", "mixer/level (simulated) ended: Tank full")
-        assert plc_gateway("notify", config).out == "mail: sent\n"
+        assert command("notify", config).out == "mail: sent\n"
     assert len(box.mails) == 3
-    missing = plc_gateway("notify", config)
+    missing = command("notify", config)
     assert (missing.code, missing.err) == (1, "mail: connection refused\n")
-    assert plc_gateway("notify", config, "pigeon").code == 2
+    assert command("notify", config, "pigeon").code == 2
 
 
 async def test_b3_8_an_alarm_dials_a_telephone_again_that_was_busy(tmp_path: Path) -> None:

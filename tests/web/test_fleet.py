@@ -12,12 +12,13 @@ import pytest
 from gateway.config import load
 from gateway.config.loading import dumped
 from gateway.errors import GatewayError
-from gateway.parts.web.fleet import api
+from gateway.parts.web.fleet import api, files
 from tests.cli.test_fleet import FILE, REPORT
 from tests.conftest import needs
 from tests.web.browser import Tab, browser
 from tests.web.serving import Client, serving
 from tests.web.test_page import text, texts
+from tests.zenoh_peer import TIMEOUT
 
 
 def reports(**changed: dict[str, object]) -> Iterator[tuple[str, bytes, float]]:
@@ -112,7 +113,10 @@ async def test_the_files_of_a_folder_are_compared_and_read_again_after_a_change(
         assert "its file differs from good.yaml" in await tab.value(text("#fleet-list"))
 
 
-async def test_a_folder_that_cannot_be_read_hides_no_gateway(tmp_path: Path) -> None:
+async def test_a_folder_that_cannot_be_read_hides_no_gateway(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "PATIENCE", TIMEOUT)
     async with serving(fleet=tmp_path / "gone") as client:
         client.north.fleet = THREE
         found = (await client.ask("/api/fleet")).json
