@@ -5,9 +5,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.long_writes import LongWrite
-from gateway.engine.device.reply_shapes import QUIET
+from gateway.engine.device.reply_shapes import QUIET, UNPROVEN
 from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
@@ -130,11 +131,32 @@ def _refused_is_unclear() -> Iterator[None]:
         raise Unclear(f"its resync was refused too: {error}") from error
 
 
+async def _resync_before(device: Device, span: Span | None, token: int, talk: Transaction) -> None:
+    """Sends a resync whose reply differs from that to a read of the `span`. Raises `Busy`."""
+    driver: Any = device.settings.driver
+    try:
+        await driver.resync(talk, span, token, device.spans_beside(span, token))
+    except Refused as error:
+        raise Busy(f"{device.name} refused the resync that goes first: {error}") from error
+
+
+async def _prove_read(device: Device, talk: Transaction) -> None:
+    """Waits until the own reply would have arrived too, where extra replies arrive. Raises `Busy`
+    if one did that could be it."""
+    if device.is_doubtful:
+        gap = device.settled_after
+        settled = await talk.settle(device.longest_reply + gap, gap)
+        if talk.traffic.contradicted or not settled.quiet:
+            raise Busy(UNPROVEN)
+
+
 async def _command(job: Command, driver: Any, transaction: Transaction) -> str:
     if job.resyncs.before is not None:
-        await driver.resync(transaction, None, job.resyncs.before, job.device.probe_spans)
+        await _resync_before(job.device, job.span, job.resyncs.before, transaction)
     if job.span is not None:
-        return " ".join(map(str, await driver.read(transaction, job.span)))
+        units = await driver.read(transaction, job.span)
+        await _prove_read(job.device, transaction)
+        return " ".join(map(str, units))
     transaction.guarded = job.submitted
     try:
         answer: str = await driver.control(transaction, job.name, job.argument)
@@ -148,7 +170,7 @@ async def _write(write: Write, talk: Transaction) -> Sent:
     driver, tag, units = write.device.settings.driver, write.tag, write.units
     verify = tag.write is not None and tag.write.verify
     if write.resyncs.before is not None:
-        await driver.resync(talk, tag.span, write.resyncs.before, write.device.probe_spans)
+        await _resync_before(write.device, tag.span, write.resyncs.before, talk)
     if write.part is not None and not write.masked:
         (word,) = await driver.read(talk, tag.span)
         units = [write.part.into(word, write.units[0])]
@@ -195,7 +217,7 @@ async def _write_run(job: WriteTogether, run: Span, talk: Transaction) -> Sent:
     driver, first = job.device.settings.driver, job.writes[0]
     held: Sequence[int] = [0] * run.size
     if first.resyncs.before is not None:
-        await driver.resync(talk, run, first.resyncs.before, job.device.probe_spans)
+        await _resync_before(job.device, run, first.resyncs.before, talk)
     if needs_read(job.writes):
         held = await _read_before(driver, run, talk)
     sending = driver.write(talk, run, together(run, job.writes, held))

@@ -52,6 +52,7 @@ class Transaction:
         "_needs_resync",
         "_on_unmatched_frame",
         "_open",
+        "_replied",
         "_stray",
         "guarded",
         "has_sent",
@@ -82,6 +83,7 @@ class Transaction:
         self._answered = 0.0  # when the last reply arrived
         self._stray: Evidence | None = None  # of frames that were no reply
         self._late: LateReply | None = None
+        self._replied: tuple[Any, Callable[[Any], Any]] | None = None  # last; what it answers
         self._gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
 
     @property
@@ -284,6 +286,7 @@ class Transaction:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
         if not is_echo and not foreign and not old and self._may_be_reply(frame):
             self.traffic.extra += 1
+            self.traffic.contradicted |= self._contradicts(frame)
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
 
@@ -291,6 +294,16 @@ class Transaction:
         """Returns False for a frame that the device sends by itself, such as an on-demand block."""
         driver = self._device.settings.driver
         return not isinstance(driver, UnnumberedReplies) or driver.is_reply(frame)
+
+    def _contradicts(self, frame: Any) -> bool:
+        """Returns True for another reply to the last request that was answered."""
+        if self._replied is None:
+            return False
+        replied, answers = self._replied
+        try:
+            return frame != replied and answers(frame) is not None
+        except DeviceError:
+            return True
 
     def _answer(self, request: _Request, frame: Any, answer: Any) -> None:
         """Ends a request that was answered, and learns of an echo."""
@@ -304,6 +317,7 @@ class Transaction:
         else:
             echo.absent_at = self._channel.quiet_since
         request.heard, self._heard = len(self._heard), b""
+        self._replied, self.traffic.contradicted = (frame, request.answers), False
         request.future.set_result(answer)
 
     def _takes_late(self, frame: Any) -> bool:

@@ -7,10 +7,9 @@ import pytest
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.device.reply_shapes import SHOWN, WARY_FOR
+from gateway.engine.device.reply_shapes import SHOWN, UNPROVEN, WARY_FOR
 from gateway.engine.forecast import forecast
 from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
-from gateway.engine.results.proofs import UNPROVEN
 from gateway.errors import Refusal, Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import Ack

@@ -11,9 +11,9 @@ import pytest
 
 from gateway.engine.device.health import State
 from gateway.engine.device.reply_shapes import WARY_FOR
-from gateway.errors import LineDown, Refused, Unclear
+from gateway.errors import Busy, LineDown, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
-from gateway.protocols.driver import AnyDriver
+from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
@@ -143,6 +143,36 @@ async def test_the_diagnosis_says_that_the_station_answers_twice(driver: AnyDriv
         assert "Answers twice: a second master" in dev.diagnosis()
         await asyncio.sleep(120)
         assert dev.diagnosis() == ""
+
+
+@by_protocol
+@pytest.mark.parametrize(
+    ("after", "every"), [(0.005, 0.02), (0.03, 0.02), (0.03, 0.2), (0.06, 0.2)]
+)
+@on_virtual_time
+async def test_no_read_on_demand_gets_another_reply_and_no_tag_gets_its_own(
+    driver: AnyDriver, after: float, every: float
+) -> None:
+    """Programs at doors and `peek` read other addresses of the same length between the polls."""
+    server = Repeater(after=after)
+    line, dev, memory = behind(server, driver, *numbered(driver, 100, 200, 300, every=every))
+    area = area_of(driver).strip(":")
+    for number in range(1000):
+        memory.write(area, number, [number])
+    wrong, found = list[tuple[int, str]](), 0
+    async with running(line):
+        await asyncio.sleep(1)
+        for number in range(600, 640):
+            server.twice = {server.replies + n for n in range(1, 1 + number % 3)}
+            with suppress(Unclear, Busy):
+                read = await line.line.peek(dev, Span(area, number, 1), 1.0)
+                found += 1
+                if read != str(number):
+                    wrong.append((number, read))
+            await asyncio.sleep(0.017 * (number % 5))
+    assert wrong == []
+    assert wrong_values(line) == []
+    assert found > 10
 
 
 @by_protocol

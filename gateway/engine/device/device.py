@@ -394,11 +394,22 @@ class Device:
         own = shapes.of_resync(self.health.outstanding, PROOF, self.probe_spans)
         return own is not None and own not in {shapes.of(span) for span in asked if span}
 
-    def note_resync(self, outstanding: Span | None, token: int, now: float) -> None:
+    def spans_beside(self, span: Span | None, token: int) -> Sequence[Span]:
+        """Returns the `probe_spans`; none where a resync in them has the form of a read of `span`:
+        then it reads near that, in another length."""
+        shapes, spans = self.shapes, self.probe_spans
+        if shapes is None or span is None:
+            return spans
+        found = (shapes.of_resync(span, one, spans) for one in (token, token + 1))
+        return () if shapes.of(span) in found else spans
+
+    def note_resync(
+        self, outstanding: Span | None, token: int, now: float, spans: Sequence[Span] | None = None
+    ) -> None:
         """Notes a resync that belongs to another request, or follows another resync."""
         if self.shapes is not None:
-            shape = self.shapes.of_resync(outstanding, token, self.probe_spans)
-            self.shapes.also_sent(shape, now)
+            spans = self.probe_spans if spans is None else spans
+            self.shapes.also_sent(self.shapes.of_resync(outstanding, token, spans), now)
 
     # Its share of the wire
 

@@ -26,6 +26,7 @@ SHOWN = 60.0  # seconds for which an extra reply explains the state of the devic
 INSIDE = 64  # units of a read inside a block, at most
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
+UNPROVEN = "extra replies arrive on this line, and nothing proves this read"
 
 
 @dataclass(slots=True)
@@ -131,7 +132,7 @@ class ReplyShapes:
         shape, read = choices[0][1], span  # the caller tells the block's own span by identity
         if now - self.at >= self.quiet:
             self._prove(now)
-        elif self._is_recent(shape, now):
+        elif self.is_recent(shape, now):
             longest_ago = used.get(shape, -NEVER)
             some = choices if self.quiet == WARY else choices[:MOST_CHOICES]
             if span in self.longer.alone:
@@ -150,9 +151,9 @@ class ReplyShapes:
         """Returns True if a longer span would be read for the block now."""
         if block.listed or now - self.at >= self.quiet:
             return False
-        return self._is_recent(self.longer.choices(block.span)[0][1], now)
+        return self.is_recent(self.longer.choices(block.span)[0][1], now)
 
-    def _is_recent(self, shape: Hashable, now: float) -> bool:
+    def is_recent(self, shape: Hashable, now: float) -> bool:
         """Returns True if one of the last two requests has the shape, or one of the last 1.5 s
         while the device answers twice."""
         if now - self._used.get(shape, -NEVER) >= self.quiet:

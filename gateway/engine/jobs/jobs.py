@@ -201,6 +201,7 @@ class Traffic:
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
+    contradicted: bool = False  # one of them could be the reply to the last request, too
     silence: float = math.inf  # seconds before its request, the shortest of several
     doubtful: bool = False  # an acknowledgement may be the echo of its request
 

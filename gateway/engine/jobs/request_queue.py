@@ -157,12 +157,12 @@ def _resync_around(job: Write | WriteTogether | Command, shapes: ReplyShapes, no
     device = job.device
     token = device.health.next_probe_token
     if isinstance(job, Command):
-        if not job.broadcast and shapes.may_be_extra(None, now):
+        own = None if job.span is None else shapes.of(job.span)
+        extra = shapes.may_be_extra(None, now) or (own is not None and shapes.is_recent(own, now))
+        if extra and not job.broadcast:
             job.resync(token())
-        shapes.sent(None, now)
-        if job.span is not None:
-            shapes.also_sent(shapes.of(job.span), now)
-        _note_resyncs(device, None, job.resyncs, now)
+        shapes.sent(own, now)
+        _note_resyncs(device, job.span, job.resyncs, now)
         return
     write = job if isinstance(job, Write) else job.writes[0]
     span, units, reads = write.tag.span, write.units, write.part is not None
@@ -178,6 +178,7 @@ def _resync_around(job: Write | WriteTogether | Command, shapes: ReplyShapes, no
 
 
 def _note_resyncs(device: Device, near: Span | None, resyncs: Resyncs, now: float) -> None:
-    for token in resyncs:
-        if token is not None:
-            device.note_resync(near, token, now)
+    if (before := resyncs.before) is not None:
+        device.note_resync(near, before, now, device.spans_beside(near, before))
+    if resyncs.after is not None:
+        device.note_resync(near, resyncs.after, now)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from gateway.engine.device.device import Device
-from gateway.engine.device.reply_shapes import SHOWN
+from gateway.engine.device.reply_shapes import SHOWN, UNPROVEN
 from gateway.engine.jobs.jobs import Probe, Result, Settle, Traffic
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
@@ -13,7 +13,6 @@ from gateway.errors import Refused, Unsteady
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
 LONGEST = 0.5  # seconds: then reads get their proof
-UNPROVEN = "extra replies arrive on this line, and nothing proves this read"
 
 
 class Proofs:
