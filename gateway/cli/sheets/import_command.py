@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gateway.cli.progress import busy
 from gateway.cli.sheets.communication_table import import_transfers, print_served
 from gateway.cli.sheets.text_file import BOM, read_file, replace, write_new
 from gateway.cli.terminal import err
@@ -74,30 +75,41 @@ def import_(
         if dry_run:
             print(_DRY)
         return
-    grid = adapted(read_grid(read_file(sheet)), _pairs(columns), _pairs(address))
-    named = [] if link_table.is_table(grid) else devices_in(grid)
-    lines = grid.project.lines if grid.project is not None else {}
-    if into is None and lines and not device:
-        print(_plant(sheet, grid, lines), end="")
-        return
-    if into is None:
-        tags, notes = preview(sheet, grid, device or (named[0] if len(named) == 1 else ""))
-        print_notes(sheet, notes)
-        print("tags:", *(f"  {entry(name, raw)}" for name, raw in tags.items()), sep="\n")
-        err.print("addresses and limits are not checked yet: name the file with --into")
-        return
-    if lines and not into.exists():
-        text = _plant(sheet, grid, lines)
-        if not dry_run:
-            write_new(into, text)
-        said = [f"{into.name}: {len(grid.rows) - 1} tags of {sheet.name} on {len(lines)} lines"]
-    else:
-        said = add_tags(sheet, into, [device] if device else named, grid=grid, dry_run=dry_run)
-    for line in [*said, _DRY] if dry_run else said:
+    with busy(f"importing {sheet.name}"):
+        said = _import(sheet, into, device, _pairs(columns), _pairs(address), dry_run=dry_run)
+    for line in [*said, _DRY] if dry_run and into is not None else said:
         print(line)
 
 
 _DRY = "nothing was written: --dry-run"
+
+
+def _import(
+    sheet: Path,
+    into: Path | None,
+    device: str | None,
+    columns: Mapping[str, str],
+    addresses: Mapping[str, str],
+    *,
+    dry_run: bool,
+) -> list[str]:
+    """Imports a sheet. Returns the lines to print."""
+    grid = adapted(read_grid(read_file(sheet)), columns, addresses)
+    named = [] if link_table.is_table(grid) else devices_in(grid)
+    lines = grid.project.lines if grid.project is not None else {}
+    if into is None and lines and not device:
+        return _plant(sheet, grid, lines).splitlines()
+    if into is None:
+        tags, notes = preview(sheet, grid, device or (named[0] if len(named) == 1 else ""))
+        print_notes(sheet, notes)
+        err.print("addresses and limits are not checked yet: name the file with --into")
+        return ["tags:", *(f"  {entry(name, raw)}" for name, raw in tags.items())]
+    if lines and not into.exists():
+        text = _plant(sheet, grid, lines)
+        if not dry_run:
+            write_new(into, text)
+        return [f"{into.name}: {len(grid.rows) - 1} tags of {sheet.name} on {len(lines)} lines"]
+    return add_tags(sheet, into, [device] if device else named, grid=grid, dry_run=dry_run)
 
 
 def _pairs(options: Sequence[str] | None) -> dict[str, str]:
