@@ -13,7 +13,7 @@ import zenoh
 from gateway.cli.client.arguments import matches, tags_by_key
 from gateway.cli.client.rows import TagRow, document, raw, reason, without_gateway
 from gateway.cli.client.tracing import traced
-from gateway.cli.client.value_pages import paged
+from gateway.cli.client.value_pages import CHANGED, REPLY_TIMEOUT, paged
 from gateway.config import ZenohConfig
 from gateway.config.gateway_address import GatewayAddress
 from gateway.contract.keys import Keys
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from gateway.cli.client.requests import Requests
     from gateway.config import Config
 
-REPLY_TIMEOUT = 10.0  # seconds
-CHANGED = "does the gateway run with the current version of this file?"
 _LONGEST_LIST = 10  # tags in one sentence
 
 

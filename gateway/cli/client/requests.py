@@ -9,8 +9,8 @@ from contextlib import suppress
 import orjson
 import zenoh
 
-from gateway.cli.client.client import CHANGED, REPLY_TIMEOUT
 from gateway.cli.client.rows import document
+from gateway.cli.client.value_pages import CHANGED, REPLY_TIMEOUT
 from gateway.config.commands import TO_ALL
 from gateway.contract.access.signatures import sign
 from gateway.contract.keys import Keys

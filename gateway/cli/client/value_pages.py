@@ -9,8 +9,10 @@ import zenoh
 
 from gateway.errors import GatewayError
 
+REPLY_TIMEOUT = 10.0  # seconds, for one query
 FIRST = 100  # values in the first page: 2 s at 64 kbit/s
 PAGE_WITHIN = 2.0  # seconds that the next page should take
+CHANGED = "does the gateway run with the current version of this file?"
 _CUT = "not all values have arrived: is the link interrupted, or slower than 64 kbit/s?"
 Query = Callable[[str], list[zenoh.Reply]]  # raises `GatewayError` for an error reply
 

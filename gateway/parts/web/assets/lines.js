@@ -161,6 +161,8 @@ function showShort(row, line) {
   row.cause.title = said(cause);
 }
 
+const namesOf = (line) => [...devices].filter(([, [of]]) => of === line).map(([name]) => name);
+
 function ownDevices(line) {
   return [...devices].filter(([, [of]]) => of === line).sort(([a, [, one]], [b, [, other]]) => (ORDER[one] ?? 0) - (ORDER[other] ?? 0) || a.localeCompare(b));
 }
@@ -186,7 +188,7 @@ function makeLine([name]) {
   card.devices = h("ul", { className: "rows" });
   card.wire = h("div");
   card.fold = h("details", { ontoggle: () => showDevices(card, name) }, card.summary, card.devices);
-  card.button = h("button", { type: "button", className: "quiet", "aria-label": t("wire of {name}", { name }), onclick: () => wireOf(name, card.wire, card.button) }, t("Wire"));
+  card.button = h("button", { type: "button", className: "quiet", "aria-label": t("wire of {name}", { name }), onclick: () => wireOf(name, card.wire, card.button, namesOf) }, t("Wire"));
   card.append(h("div", { className: "bar" }, h("h2", {}, name), card.state, card.button), card.causes, card.past, card.timeline, card.doors, h("div", { className: "bar" }, card.chart, card.load), card.fold, card.wire);
   return card;
 }

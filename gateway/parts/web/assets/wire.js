@@ -3,7 +3,6 @@
 import { byId, h, put } from "./dom.js";
 import { said, t } from "./language.js";
 import { follow, now, on } from "./stream.js";
-import { devices } from "./lines.js";
 
 const WINDOW = 10000; // ms
 const MOST_ROWS = 24;
@@ -11,11 +10,11 @@ const LISTED = 15; // exchanges below the chart
 const LEGEND = { read: t("read"), write: t("write"), probe: t("probe"), wait: t("wait for a late reply"), failed: t("failed ×") };
 const KINDS = { read: "read", write: "write", probe: "probe" };
 
-let shown = null; // { line, place, button, and the elements }
+let shown = null; // { line, place, button, the elements, and a function that returns the devices }
 let exchanges = [];
 let missed = 0;
 
-export function wireOf(line, place, button) {
+export function wireOf(line, place, button, devicesOf) {
   const was = shown?.line;
   close();
   if (was === line) return;
@@ -25,7 +24,7 @@ export function wireOf(line, place, button) {
   const legend = h("p", { className: "legend", "aria-hidden": "true" }, ...Object.entries(LEGEND).map(([kind, text]) => h("span", { className: kind }, text)));
   place.replaceChildren(canvas, legend, sum, h("details", {}, h("summary", {}, t("Last exchanges, decoded")), list));
   button.setAttribute("aria-pressed", "true");
-  shown = { line, place, button, canvas, list, sum };
+  shown = { line, place, button, canvas, list, sum, devicesOf };
   follow({ line });
 }
 
@@ -58,11 +57,11 @@ on("wire", (found) => {
 on("time", () => shown && draw());
 
 function draw() {
-  const { line, canvas, sum } = shown;
+  const { line, canvas, sum, devicesOf } = shown;
   const until = now();
   const seen = exchanges.filter((one) => one.begun + one.took * 1000 > until - WINDOW);
   const of = (device) => seen.filter((one) => one.device === device);
-  const names = [...devices].filter(([, [own]]) => own === line).map(([name]) => name);
+  const names = devicesOf(line);
   const rows = names.length > MOST_ROWS ? names.filter((name) => of(name).length).slice(0, MOST_ROWS) : names;
   const failed = seen.filter((one) => one.failed).length;
   const busy = seen.reduce((all, one) => all + one.took, 0);
