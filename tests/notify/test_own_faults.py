@@ -147,6 +147,25 @@ async def test_each_fault_has_an_alarm_of_its_own_unless_the_file_wants_none(
         assert not [key for key, _ in entries if key.startswith(GATEWAY)]
 
 
+async def test_what_a_full_disk_did_not_take_is_saved_when_it_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault "not saved" would last until the next message, and a kill would lose the queue."""
+    path = tmp_path / "notify.json"
+    path.mkdir()  # no file can have its name
+    monkeypatch.setattr(notify, "LOOK_EVERY", 0.01)
+    with capture_logs():
+        async with Told(tmp_path, monkeypatch) as gateway, asyncio.timeout(300):
+            part = find(gateway.parts, notify.NotifyPart)
+            part._unsaved = True
+            while not part.documents()["files/notify"]["trouble"]:
+                await asyncio.sleep(0.01)
+            path.rmdir()
+            while part.documents()["files/notify"]["trouble"]:
+                await asyncio.sleep(0.01)
+    assert path.is_file()
+
+
 def test_each_fault_of_the_page_of_codes_is_an_alarm() -> None:
     """Lines, devices and transfers have alarms of their own."""
     table = PAGE.read_text().partition("## Faults")[2].partition("## Warnings")[0]

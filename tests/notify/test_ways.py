@@ -15,6 +15,7 @@ import pytest
 from aiohttp import web
 from aiosmtpd.controller import Controller
 from aiosmtpd.smtp import AuthResult, Envelope, LoginPassword, Session
+from structlog.testing import capture_logs
 
 from gateway.config import load
 from gateway.errors import GatewayError
@@ -119,6 +120,30 @@ def test_a_mail_that_the_server_refuses_is_not_sent(tmp_path: Path) -> None:
         assert str(raised.value).isprintable()
     with pytest.raises(GatewayError, match="refused"):
         asyncio.run(send(SENT))
+
+
+def test_a_mail_is_sent_once_whatever_the_server_says_then_and_who_is_refused_is_said(
+    tmp_path: Path,
+) -> None:
+    class Odd(Mailbox):
+        async def handle_RCPT(
+            self, _server: Any, _session: Session, envelope: Envelope, to: str, _options: Any
+        ) -> str:
+            if to.startswith("gone"):
+                return "550 no such person"
+            envelope.rcpt_tos.append(to)
+            return "250 OK"
+
+        async def handle_QUIT(self, _server: Any, _session: Session, _envelope: Any) -> str:
+            return "421 tired"
+
+    box = Odd()
+    with mail_server(box) as port, capture_logs() as logs:
+        known = {"from": "a@b.example", "to": ["gone@d.example", "c@d.example"]}
+        asyncio.run(way(tmp_path, "mail", server=f"smtp://127.0.0.1:{port}", **known)(SENT))
+    assert len(box.mails) == 1
+    [entry] = [one for one in logs if one["event"] == "mail refused"]
+    assert entry["to"] == ["gone@d.example"]
 
 
 async def test_a_mail_server_that_never_answers_holds_one_thread(tmp_path: Path) -> None:

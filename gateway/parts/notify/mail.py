@@ -8,11 +8,14 @@ from datetime import UTC, datetime
 from email.message import EmailMessage
 from email.utils import format_datetime
 
+import structlog
+
 from gateway.errors import GatewayError
 from gateway.parts.notify.answers import first_line, said, trusted
 from gateway.parts.notify.message import Message
 from gateway.parts.notify.settings import MailSection, Server
 
+log = structlog.get_logger("gateway")
 _STEP_WITHIN = 10.0  # seconds for each answer of a mail server
 _ALL_WITHIN = 30.0  # seconds for all of them
 _MOST_REPLIES = 65_536  # bytes of one connection to a mail server
@@ -59,15 +62,19 @@ class Mail:
 
     def send(self, message: Message) -> None:
         settings = self._settings
+        refused: dict[str, tuple[int, bytes]] | None = None  # of a mail that the server has taken
         try:
             with self._connected(settings.server) as server:
                 if settings.user and settings.password_file:
                     server.login(settings.user, first_line(settings.password_file, "mail"))
-                server.send_message(_mail(message, settings.from_, self._to))
+                refused = server.send_message(_mail(message, settings.from_, self._to))
         except smtplib.SMTPRecipientsRefused as error:
             raise GatewayError(f"the server refuses {', '.join(error.recipients)}") from None
         except (OSError, smtplib.SMTPException, ValueError) as error:
-            raise GatewayError(said(error)) from None
+            if refused is None:  # later only the farewell was wrong: the mail is sent once
+                raise GatewayError(said(error)) from None
+        if refused:
+            log.warning("mail refused", to=[*refused], effect="the others have it")
 
     def _connected(self, at: Server) -> smtplib.SMTP:
         if at.scheme == "smtps":

@@ -105,7 +105,8 @@ class NotifyPart:
                 self._apply(self._alarms, found[0].one)
             else:
                 self._apply(self._without_list(), _as_before)
-            if self._unsaved and self._file.save_soon(self._snapshot()):
+            is_due = self._unsaved or self._file.trouble  # a disk that was full may have room
+            if is_due and self._file.save_soon(self._snapshot()):
                 self._unsaved = False
             await asyncio.sleep(LOOK_EVERY)
 
