@@ -5,6 +5,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from urllib.parse import quote
 
 import aiohttp
 import pytest
@@ -308,6 +309,10 @@ async def test_a_trend_has_a_cursor_a_zoom_and_bands_of_bad_quality(
         )
         plant.now(SPEED.key, 600)
         async with serving(history=historian, plant=plant) as client:
+            await opened(tab, client)
+            await tab.until("document.querySelector('[data-view=trend]').hash.length > 6")
+            await tab.click("[data-view=trend]")  # begins with tags of the overview
+            await tab.until(f"location.hash === '#trend?tags={quote(SPEED.key, safe='')}'")
             await opened(tab, client, f"trend?tags={SPEED.key}&span=600")
             await tab.until("!!document.querySelector('#chart .u-over')")
             span = "(([, a, b]) => b - a)(location.hash.match(/from=([\\d.]+)&to=([\\d.]+)/) ?? [])"

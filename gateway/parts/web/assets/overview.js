@@ -55,7 +55,7 @@ function showTiles(keys) {
   fill();
   showAll();
   if (!keys.length) byId("tiles").replaceChildren(h("li", { className: "soft" }, t("No tag is chosen.")));
-  const curves = keys.filter((key) => !tagOf(key).meta.length && tagOf(key).meta.type !== "string").slice(0, PENS);
+  const curves = keys.filter((key) => tagOf(key).meta.history && !tagOf(key).meta.length && tagOf(key).meta.type !== "string").slice(0, PENS);
   document.querySelector("[data-view=trend]").href = curves.length ? `#trend?tags=${encodeURIComponent(curves.join(","))}` : "#trend";
   byId("chosen").replaceChildren(
     ...(pinned ? [t("Chosen on this page."), " ", h("button", { type: "button", className: "link", onclick: unpin }, t("Show the choice of the file"))] : []),

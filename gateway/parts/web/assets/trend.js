@@ -407,7 +407,7 @@ function caption(idx = null) {
   const why = drawn.series.map((one) => one.why).filter(Boolean);
   const [from, to] = range();
   const at = (time) => (to - from > 86400 ? new Date(time * 1000).toLocaleString(dates, { hour12: false }) : clock(time * 1000));
-  put("trend-text", [`${t("{from} to {to}", { from: at(from), to: at(to) })}${fixed ? "" : ` ${t("(now)")}`}${t(", ")}${t("each point {span}", { span: length(drawn.step) })}`, ...why].join(". "));
+  put("trend-text", [`${t("{from} to {to}", { from: at(from), to: at(to) })}${fixed ? "" : ` ${t("(now)")}`}${t(", ")}${t("each point {span}", { span: length(drawn.step) })}`, ...why].join("; "));
 }
 
 function length(step) {
