@@ -403,8 +403,8 @@ async def test_from_an_unknown_line_to_twenty_tags_on_zenoh_in_a_browser(tmp_pat
         await page.click("#back", "document.getElementById('trial').hidden")
         assert len(load(path).devices[0].tags) == 20
         await tab.until(f"{shown('#good')} === '20 of 20 values are good'")
-        assert api.trial.said == "The file is as before."
         await tab.until(f"{shown('#said')} === 'The file is as before.'")
+        assert api.trial.said == "The file is as before."
         # Of a second line the page shows the first new station, not the one before.
         await tab.value("document.getElementById('protocol').value = 'modbus-rtu'")
         await page.click("#simulate", "!document.getElementById('stations-form').hidden")

@@ -12,11 +12,12 @@ from typing import Any
 from aiohttp import web
 
 from gateway.cli.bench.draft import Draft
-from gateway.cli.bench.line import SIMULATED, Registers, Scan, protocols, values
+from gateway.cli.bench.line import SIMULATED, Registers, Scan, values
 from gateway.cli.bench.running import Running
 from gateway.cli.bench.trial import CONFIRM_WITHIN, Trial
 from gateway.cli.client.arguments import parse_value
 from gateway.cli.config.new import serial_ports
+from gateway.cli.line.scan import protocols
 from gateway.config.sheets.tags import other_settings
 from gateway.errors import ConfigError, GatewayError
 from gateway.parts.web.routes import Route, answer, as_json, body

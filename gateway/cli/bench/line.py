@@ -17,9 +17,7 @@ from gateway.cli.line.scan_command import noises
 from gateway.config import Config
 from gateway.errors import ConfigError, GatewayError
 from gateway.planning.wire_timing import WireTiming, character_bits
-from gateway.protocols.capabilities import Scannable
 from gateway.protocols.driver import Address, Unit
-from gateway.protocols.registry import PROTOCOLS
 from gateway.simulator.plant import station_for
 from gateway.simulator.serve import Served, serve_on_tcp
 from gateway.tags.unit_tag import unit_tag
@@ -32,11 +30,6 @@ _MOVING = 20  # words of each that move; the others keep what is written
 EVERY = 0.4  # seconds
 _ASKED_FOR = 10.0  # seconds that registers are read for a page that has gone
 _ALL = 10_000  # characters: every column
-
-
-def protocols() -> list[str]:
-    """Returns those that `scan` knows."""
-    return [name for name, one in PROTOCOLS.items() if isinstance(one.settings, Scannable)]
 
 
 class Scan:

@@ -73,16 +73,17 @@ def variants(protocol: str, station: int) -> Iterator[tuple[AnyDriver, dict[str,
         yield known.driver(known.settings(station=station, **settings)), dict(settings)
 
 
+def protocols() -> list[str]:
+    """Returns those that `scan` knows. Reads the metadata of all packages, which takes long."""
+    return [name for name, one in PROTOCOLS.items() if isinstance(one.settings, Scannable)]
+
+
 def _hints(protocol: str) -> ScanHints:
     """Raises `ConfigError` for a protocol that `scan` cannot use."""
-    found: dict[str, ScanHints] = {
-        name: known.settings.scan_hints
-        for name, known in PROTOCOLS.items()
-        if isinstance(known.settings, Scannable)
-    }
-    if protocol not in found:
-        raise ConfigError(f"scan cannot look for {protocol}: use one of {', '.join(found)}")
-    return found[protocol]
+    known = PROTOCOLS.get(protocol)
+    if known is None or not isinstance(known.settings, Scannable):
+        raise ConfigError(f"scan cannot look for {protocol}: use one of {', '.join(protocols())}")
+    return known.settings.scan_hints
 
 
 def planned(
