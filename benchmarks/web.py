@@ -171,7 +171,8 @@ async def first_paint(port: int, chromium: str, profile: Path) -> tuple[float, f
     were loaded until then."""
     async with browser(chromium, profile) as tab:
         await tab.open(f"http://127.0.0.1:{port}/#overview")
-        await tab.until("performance.getEntriesByName('values').length > 0")
+        for name in ("values", "first-paint"):  # in any order
+            await tab.until(f"performance.getEntriesByName('{name}').length > 0")
         paint = await tab.value('performance.getEntriesByName("first-paint")[0].startTime')
         live = await tab.value('performance.getEntriesByName("values")[0].startTime')
         size = await tab.value(
