@@ -50,13 +50,6 @@ GAP = 0.02  # seconds without a byte that end a run of noise
 TOO_MANY = "line {line}: too many requests are waiting; not sent"
 
 
-def ends_well(job: Transacted, result: Result) -> bool:
-    """Returns True for a good read, and for a write that is acknowledged and tells nothing new."""
-    if isinstance(job, Write):
-        return isinstance(result, Sent) and result.acknowledged and not job.masked
-    return isinstance(job, Poll) and not isinstance(result, Exception)
-
-
 class Engine:
     """The rules of one line, and its state."""
 
@@ -90,8 +83,8 @@ class Engine:
 
     def next(self, now: float) -> Job:
         """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
-        job = self._next(now)
-        for rule in self.rules.preparing:
+        job, rules = self._next(now), self.rules
+        for rule in rules.preparing_polls if isinstance(job, Poll) else rules.preparing:
             if rule.prepares:
                 rule.before(job, now)
         return job
@@ -143,8 +136,10 @@ class Engine:
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
-        good, in_flight = self._note(job, result, traffic, now, time), self._in_flight
+        in_flight = self._in_flight
         if isinstance(job, Poll):
+            good = not isinstance(result, Exception)
+            self._note(job, result, traffic, now, time, good=good)
             entry = in_flight.open.pop(job)
             if good:  # units are the only good result of a poll
                 units = cast("Sequence[int]", result)
@@ -159,10 +154,8 @@ class Engine:
                 return self._effects.take()
             if in_flight.failed:
                 self._next_job.polls_ended(traffic, now, time)
-        elif good and isinstance(job, Write) and isinstance(result, Sent):
-            self._requests.written(job, result, now, time)
         else:
-            self._next_job.conclude(job, result, traffic, now, time)
+            good = self._conclude_other(job, result, traffic, now, time)
         if in_flight.continuation is None:
             in_flight.job = None
             in_flight.failed.clear()
@@ -174,11 +167,34 @@ class Engine:
             self._set_deadline()  # a good end alone makes it no earlier
         return effects
 
-    def _note(
+    def _conclude_other(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> bool:
-        """Passes the result to the rules, and counts it. Returns True if the job ended well."""
-        device, rules, good = job.device, self.rules, ends_well(job, result)
+        """Applies the result of a job that is no poll. Returns True for a write that is
+        acknowledged and tells nothing new."""
+        if isinstance(job, Write) and isinstance(result, Sent):
+            good = result.acknowledged and not job.masked
+            self._note(job, result, traffic, now, time, good=good)
+            if good:
+                self._requests.written(job, result, now, time)
+                return True
+        else:
+            self._note(job, result, traffic, now, time, good=False)
+        self._next_job.conclude(job, result, traffic, now, time)
+        return False
+
+    def _note(
+        self,
+        job: Transacted,
+        result: Result,
+        traffic: Traffic,
+        now: float,
+        time: int,
+        *,
+        good: bool,
+    ) -> None:
+        """Passes the result to the rules, and counts it. `good`: the job ended well."""
+        device, rules = job.device, self.rules
         if not good or rules.troubled:
             after = rules.after(device, good=good)
         else:
@@ -190,7 +206,6 @@ class Engine:
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if device.shapes is not None:
             device.shapes.at = now
-        return good
 
     @property
     def was_answered(self) -> bool:

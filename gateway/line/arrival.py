@@ -49,7 +49,9 @@ class ArrivalClock:
 
     def __call__(self) -> int:
         """Returns ns since 1970."""
-        behind = max(self._behind, self._now() - self._due)
+        behind = self._now() - self._due
+        if behind < self._behind:
+            behind = self._behind
         return self._wall() - int(behind * 1e9)
 
     def document(self) -> Mapping[str, object]:

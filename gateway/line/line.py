@@ -35,6 +35,7 @@ from gateway.transport import Port, Receiver
 from gateway.transport.port import Noted
 
 log = structlog.get_logger("gateway.line")
+RESTS = (Idle, Reopen)  # jobs without a transaction; `Idle | Reopen` makes an object each time
 
 
 class SampleSink(Protocol):
@@ -317,7 +318,7 @@ class Line:
             if self._lost is not None or self._waiting is not None or engine.deadline <= begun:
                 self.catch_up(begun)
             job = engine.next(begun)
-            if isinstance(job, Idle | Reopen):
+            if isinstance(job, RESTS):
                 if await self._rest(job, begun):
                     return
                 continue

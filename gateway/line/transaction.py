@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Settled, Traffic
@@ -119,7 +119,8 @@ class Transaction:
             if channel.quiet_since + device.silence.kept > started:
                 await channel.quiet(device.silence)
                 started = channel.now()
-            self._begin_hearing()
+            if self.has_sent:
+                self._begin_hearing()
             silence = started - channel.quiet_since
             if silence < self.traffic.silence:
                 self.traffic.silence = silence
@@ -146,14 +147,14 @@ class Transaction:
             unanswered.answered(started, channel.quiet_since)
         busy = (len(data) + request.heard) * character
         # Of several outstanding requests, each has its own part of the time.
-        alone = max(started, self._answered)
-        self._answered = channel.quiet_since
+        alone = max(started, self._answered) if self._answered else started
+        self._answered = answered = channel.quiet_since
         traffic = self.traffic
         traffic.exchanges += 1
-        own = self._answered - alone - busy
+        own = answered - alone - busy
         if request.equal:
             unproven = started - channel.echo.absent_at
-            self.traffic.doubtful = device.may_be_echo(own, unproven)
+            traffic.doubtful = device.may_be_echo(own, unproven)
         if own > 0.0:
             traffic.turnaround += own
         return answer
@@ -204,16 +205,15 @@ class Transaction:
             self._gap.cancel()
         self._take(self._codec.feed, data)
         if self._broken is None:
-            self._expect_silence()
+            if _may_end_by_gap(type(self._codec)):
+                self._expect_gap(cast("EndedByGap[Any]", self._codec))
+            elif self._heard and self._open and (quiet := self._spoiled_after()) is not None:
+                self._gap = channel.loop.call_later(quiet, self._spoiled)
 
-    def _expect_silence(self) -> None:
-        """Sets the timer for a silence that ends the frame, or shows that a reply is spoiled."""
-        codec, loop = self._codec, self._channel.loop
-        if _may_end_by_gap(type(codec)):
-            if isinstance(codec, EndedByGap) and (gap := codec.gap_timeout):
-                self._gap = loop.call_later(gap, self._take, codec.expire)
-        elif self._open and (quiet := self._spoiled_after()) is not None:
-            self._gap = loop.call_later(quiet, self._spoiled)
+    def _expect_gap(self, codec: EndedByGap[Any]) -> None:
+        """Sets the timer for a silence that ends the frame."""
+        if gap := codec.gap_timeout:
+            self._gap = self._channel.loop.call_later(gap, self._take, codec.expire)
 
     def _spoiled_after(self) -> float | None:
         """Returns the silence after which a reply of full length is spoiled; None: it goes on.
@@ -359,7 +359,7 @@ class Transaction:
         return verdict(request, self._heard, self._channel.echo.early, self._stray)
 
 
-@cache
+@cache  # `isinstance` with a protocol takes as long as the rest of a read
 def _may_end_by_gap(codec: type[Codec[Any]]) -> bool:
     return hasattr(codec, "gap_timeout")
 

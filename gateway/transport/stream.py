@@ -38,7 +38,9 @@ class Allowance:
 
     def requested(self) -> None:
         """Allows the reply to one more request."""
-        self._level = max(0.0, self._level - PER_REQUEST)
+        self._level -= PER_REQUEST
+        if self._level < 0.0:
+            self._level = 0.0
 
     def received(self, size: int, now: float) -> float:
         """Notes received bytes. Returns the bytes per second if they are too many, else 0."""

@@ -98,6 +98,19 @@ class Outstanding:
         self.either = 0
 
 
+@dataclass(slots=True)
+class Presence:
+    """Notes that a device of a line came online, or is no longer online."""
+
+    changed: bool = True
+
+    def note(self) -> None:
+        self.changed = True
+
+    def seen(self) -> None:
+        self.changed = False
+
+
 @dataclass(slots=True, eq=False)
 class Health:
     """The state of one device, and its outstanding requests.
@@ -123,9 +136,15 @@ class Health:
     _extra: bool = False  # an extra reply arrived since the last resync
     # A device server may hold requests to its station that this device never sent.
     inherits: bool = False
+    _presence: Presence = field(default_factory=Presence)  # of the devices of its line
 
     def __post_init__(self) -> None:
         self.needs_resync = self.is_probed
+
+    def report(self, presence: Presence) -> None:
+        """Reports there from now on when it comes online, or is no longer online."""
+        self._presence = presence
+        presence.note()
 
     def inherit(self, *, inherits: bool = True) -> None:
         """Notes that a device server may have kept earlier requests to the station, or that it has
@@ -286,7 +305,10 @@ class Health:
 
     def _move(self, event: Event) -> None:
         self.state = TRANSITIONS[self.state, event]
-        self.online = self.state in (State.ONLINE, State.FAILING)
+        online = self.state in (State.ONLINE, State.FAILING)
+        if online is not self.online:
+            self.online = online
+            self._presence.note()
 
     # Frames of a device that only sends unsolicited frames
 

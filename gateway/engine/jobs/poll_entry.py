@@ -14,6 +14,7 @@ from gateway.tags import Sample
 from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
+MEAN_OF = 10  # gaps between two reads
 SLOT = 0.05  # seconds: polls of one slot begin together, so that the program wakes less often
 
 
@@ -26,7 +27,7 @@ class BlockReads:
     scan: Scan | None = None  # the next read is compared with it; None: with nothing
     count: int = 0  # good ones since it was planned
     overruns: int = 0  # rounds that were skipped because the one before was late
-    mean_gap: float = 0.0  # between two good reads, smoothed over about ten
+    mean_gap: float = 0.0  # between two good reads, smoothed over about `MEAN_OF`
     worst_gap: float = 0.0
 
     def take(self, block: Block, units: Sequence[int], now: float, time: int) -> Sequence[Sample]:
@@ -35,7 +36,10 @@ class BlockReads:
             gap = now - self.at
             if gap > self.worst_gap:
                 self.worst_gap = gap
-            self.mean_gap += (gap - self.mean_gap) / (min(10, self.count) or 1)
+            known = self.count or 1
+            if known > MEAN_OF:  # `min` would take 600 instructions
+                known = MEAN_OF
+            self.mean_gap += (gap - self.mean_gap) / known
         self.count += 1
         self.at, self.ever = now, True
         if block.of_fields:
@@ -196,8 +200,8 @@ class PollEntry:
             self.missed += 1
             every = self.every
         asked, self.tries = self.asked, 0
-        behind = int((asked - self.due) / every)
-        if behind:
+        if asked - self.due >= every:
+            behind = int((asked - self.due) / every)
             device.record.count_overruns(behind)
             self.reads.count_overruns(behind)
             self.due = asked + every

@@ -26,7 +26,7 @@ class Rule(Protocol):
     `now` is the line's clock in seconds, `time` is in nanoseconds since 1970.
     """
 
-    # False: it has nothing to say while the last job of each device ended well.
+    # False: it has nothing to say of polls while the last job of each device ended well.
     always: bool = True
 
     # False: `before` has nothing to do at present.
@@ -58,7 +58,7 @@ class Rule(Protocol):
         return poll.device.window - 1
 
     def before(self, job: Job, now: float) -> None:
-        """Prepares a job that is performed next."""
+        """Prepares a job that is performed next. Without `always` it is not called for polls."""
         return
 
     # What follows from this result, or from what was heard?
@@ -124,6 +124,7 @@ class Rules:
         self.free = [rule.free for rule in using if _has(rule, Rule.free)]
         self.beside = [rule.beside for rule in using if _has(rule, Rule.beside)]
         self.preparing = [rule for rule in using if _has(rule, Rule.before)]
+        self.preparing_polls = [rule for rule in self.preparing if rule.always]
         self.concluded = [rule.concluded for rule in using if _has(rule, Rule.concluded)]
         always = [rule for rule in using if rule.always]
         self.asked_always = any(_has(rule, Rule.free) or _has(rule, Rule.first) for rule in always)

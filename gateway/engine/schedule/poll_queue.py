@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.engine.device.device import Device
+from gateway.engine.device.reply_shapes import ReplyShapes
 from gateway.engine.jobs.poll_entry import EXPEDITED, NOT_QUEUED, ON_DEMAND, PollEntry
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
@@ -106,11 +107,11 @@ class PollQueue:
             poll.ticket = EXPEDITED
             self.expedited.insert(place, poll)
 
-    def first_to_differ(self, first: PollEntry, now: float) -> PollEntry:
+    def first_to_differ(self, first: PollEntry, shapes: ReplyShapes, now: float) -> PollEntry:
         """Returns the first due poll, or in its place one of the next whose reply has another shape
         than those just before. It must not be much later, nor make the first one late."""
-        shapes, heap = first.device.shapes, self.by_device[first.device].heap
-        if shapes is None or len(heap) == 1 or not shapes.collides(first.block, now):
+        heap = self.by_device[first.device].heap
+        if len(heap) == 1 or not shapes.collides(first.block, now):
             return first
         deadline = heap[0][0]
         if now < deadline < now + OVERTAKEN:
@@ -189,9 +190,9 @@ class PollQueue:
         if own is None:
             own = self._own = self.by_device[poll.device] = DuePolls(poll.device)
         heap = own.heap
-        deadline = min(
-            poll.due + poll.block.every, poll.soon
-        )  # as `poll.deadline`, which is slower
+        deadline = poll.due + poll.block.every  # as `poll.deadline`, which is slower
+        if deadline > poll.soon:
+            deadline = poll.soon
         heapq.heappush(heap, (deadline, poll.ticket, poll))
         if len(heap) > own.most:
             heap[:] = [entry for entry in heap if _is_valid(entry)]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import State
+from gateway.engine.device.health import Presence, State
 from gateway.engine.jobs.jobs import Idle, Probe, WriteTogether
 from gateway.engine.jobs.poll_entry import EXPEDITED, ON_DEMAND, BlockReads, PollEntry
 from gateway.engine.jobs.request_queue import RequestQueue
@@ -58,6 +58,8 @@ class Schedule:
         self._queue = PollQueue(shared=len(devices) > 1)
         self._polls: dict[Device, list[PollEntry]] = {}
         self._readers: dict[Device, dict[Tag, PollEntry]] = {}  # made at the first call of `reader`
+        self._presence = Presence()
+        self._absent: Sequence[Device] = ()  # devices that are not online
         self._wrote = False
         self._expedited = False
         self._on_demand_lane = now  # until then no poll on demand delays another
@@ -73,6 +75,7 @@ class Schedule:
 
         `renewed`: tags of the polls before whose values go on as those of other tags.
         """
+        device.health.report(self._presence)
         before = self._polls.get(device, ())
         old = {poll.block.span: poll for poll in before}
         by_tag = [(renewed.get(tag, tag), poll) for poll in before for tag in poll.block.tags]
@@ -96,6 +99,7 @@ class Schedule:
 
     def change(self, changes: Changes, now: float) -> None:
         """Takes over changed devices of the line, which are in `devices` already."""
+        self._presence.note()
         for old, new in changes.replaced:
             self._polls[new] = self._polls.pop(old)
             self._readers.pop(old, None)
@@ -216,11 +220,11 @@ class Schedule:
             if job is not None:
                 return job
         self._wrote = False
-        # `online` alone is slower: almost always all devices are in the first state.
-        online = State.ONLINE
-        others = [d for d in self.devices if d.health.state is not online and not d.health.online]
-        if others:
-            probe = self._probes.next(others, now, now if due else until)
+        if self._presence.changed:
+            self._presence.seen()
+            self._absent = [device for device in self.devices if not device.health.online]
+        if self._absent:
+            probe = self._probes.next(self._absent, now, now if due else until)
             if isinstance(probe, Probe):
                 return probe
             until = min(until, probe)
@@ -264,8 +268,8 @@ class Schedule:
         first = queue.expedited and not self._expedited and self._may_expedite(now, now)
         if expedited := poll is None or bool(first):
             poll = queue.expedited[0]
-        else:
-            poll = queue.first_to_differ(poll, now)
+        elif (shapes := poll.device.shapes) is not None:
+            poll = queue.first_to_differ(poll, shapes, now)
         shapes = poll.device.shapes
         if shapes is not None and shapes.mark_due <= now < shapes.at + shapes.quiet:
             poll.device.health.left_outstanding(shapes.span, now)

@@ -6,12 +6,13 @@ from gateway.errors import Evidence, Garbled
 from gateway.protocols.modbus.frame import Frame
 
 _HEADER = Struct(">HHHB")  # transaction, protocol (0), length from here on, unit
+_SIZE, _header_of = _HEADER.size, _HEADER.unpack_from
 _UNIT_AND_PDU = range(2, 255)
 
 
 def chars(pdu_length: int) -> int:
     """Returns the bytes of a frame around a PDU."""
-    return pdu_length + _HEADER.size
+    return pdu_length + _SIZE
 
 
 class MbapCodec:
@@ -32,8 +33,8 @@ class MbapCodec:
         """Returns the frames completed by `data`. Raises `Garbled`, after the frames before it."""
         heard = self._heard + data if self._heard else data
         frames: list[Frame] = []
-        while len(heard) >= _HEADER.size:
-            transaction, protocol, length, unit = _HEADER.unpack_from(heard)
+        while len(heard) >= _SIZE:
+            transaction, protocol, length, unit = _header_of(heard)
             if protocol or length not in _UNIT_AND_PDU:
                 if frames:
                     break
@@ -41,7 +42,7 @@ class MbapCodec:
             end = length + 6
             if len(heard) < end:
                 break
-            frames.append(Frame(unit, heard[_HEADER.size : end], transaction))
+            frames.append(Frame(unit, heard[_SIZE:end], transaction))
             heard = heard[end:]
         self._heard = heard
         return frames
