@@ -9,7 +9,7 @@ noise hit it. So the block is tried once more as a whole. It is split if it fail
 as a whole again after growing pauses.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -81,6 +81,12 @@ class _Node:
             return {(self.span.area, self.halves[1].span.start)}
         return set().union(*(half.splits() for half in self.halves))
 
+    def open(self) -> set[Span]:
+        """Returns the failed blocks, of this one and its halves, whose search has not ended."""
+        if not self.halves or self.is_damaged or self.settled():
+            return set()
+        return {self.span}.union(*(half.open() for half in self.halves))
+
     def failed_twice(self) -> set[Cut]:
         """Returns the boundaries between the halves of failed blocks, where a half failed too."""
         failed = (half for half in self.halves if half.halves or half.good is False)
@@ -95,6 +101,11 @@ def within(inner: Span, outer: Span) -> bool:
     return inner.area == outer.area and (
         outer.start <= inner.start and inner.start + inner.size <= outer.start + outer.size
     )
+
+
+def _is_inside(cut: Cut, blocks: Iterable[Span]) -> bool:
+    area, n = cut
+    return any(within(Span(area, n - 1, 2), span) for span in blocks)
 
 
 def _bounds(span: Span) -> set[Cut]:
@@ -114,7 +125,7 @@ class BadAddresses:
     splits: set[Cut] = field(default_factory=set)
     searches: list[_Node] = field(default_factory=list)  # failed blocks, not yet settled
     changed: set[Span] = field(default_factory=set)  # to be planned again
-    silenced: set[Span] = field(default_factory=set)  # it went offline at these, after a reply
+    silenced: set[Span] = field(default_factory=set)  # one failure halves these, also for later
     clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
@@ -161,7 +172,7 @@ class BadAddresses:
         if not halves:
             node.good = False
             self.bad[block.span] = BadRange(block.span, now, code, block.tags)
-        elif block.span in self.silenced:  # the search may be dropped if it goes offline again
+        elif block.span in self.silenced:  # the search may be dropped again
             self.splits.add((block.span.area, halves[1].span.start))
         return halves
 
@@ -224,9 +235,10 @@ class BadAddresses:
     def abandon(self) -> None:
         """Drops the searches: the device gets other blocks, and a bad address is found again.
 
-        The next search goes on in the halves that failed too, or it would never end on a line that
-        is often interrupted."""
+        The next search goes on where this one ends, or it would never end on a line that is often
+        interrupted: in the halves that failed too, and in whole blocks after one failure."""
         self.splits |= self._open_splits()
+        self.silenced |= self._open_spans()
         self.searches.clear()
         self._leaves.clear()
         self._look()
@@ -238,6 +250,18 @@ class BadAddresses:
     def _open_splits(self) -> set[Cut]:
         open_ones = (root for root in self.searches if not root.settled())
         return set().union(*(root.failed_twice() for root in open_ones))
+
+    def _open_spans(self) -> set[Span]:
+        return set[Span]().union(*(root.open() for root in self.searches))
+
+    def take_over(self, old: "BadAddresses", blocks: Collection[Span]) -> None:
+        """Goes on with the searches of the same station, which has a new plan of these blocks."""
+        self.silenced |= (old.silenced | old._open_spans()).intersection(blocks)
+        ended = (root.splits() for root in old.searches if root.settled())
+        suspected = old._suspected.union(*ended)
+        self._suspected |= {cut for cut in suspected if _is_inside(cut, blocks)}
+        self._rejoin_at, self._rejoin_pause = old._rejoin_at, old._rejoin_pause
+        self._look()
 
     def known(self) -> KnownBad:
         refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())

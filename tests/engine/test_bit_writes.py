@@ -10,6 +10,7 @@ from gateway.errors import DeviceError, Refusal, Refused
 from gateway.tags import WriteResult
 from gateway.values import Value
 from tests.engine.rig import SILENCE, Rig, bit_device, link_device
+from tests.engine.test_change import change
 
 LACKS = Refused("no such function", code="01", unexecuted=True)
 BUSY = Refused("busy", code="06", refusal=Refusal.BUSY, unexecuted=True)
@@ -71,6 +72,13 @@ def test_a_device_that_lacks_it_is_tried_again_after_an_hour(rig: Rig) -> None:
     rig.now += LACKED_FOR
     rig.engine.expire(rig.now, rig.time)
     assert sent(rig).masked
+
+
+def test_a_device_that_lacks_it_lacks_it_after_a_reload_too(rig: Rig) -> None:
+    rig.conclude(sent(rig), LACKS)
+    rig.conclude(following(rig), Sent())
+    change(rig, rig.device, late_guard=0.7)
+    assert not sent(rig).masked
 
 
 @pytest.mark.parametrize(("error", "next_one"), [(SILENCE, False), (BUSY, True), (FAULT, True)])

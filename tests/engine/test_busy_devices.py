@@ -7,6 +7,7 @@ from gateway.engine.jobs.jobs import Poll
 from gateway.engine.jobs.requests import Write
 from gateway.errors import Refusal, Refused
 from tests.engine.rig import Rig, link_device
+from tests.engine.test_change import change
 
 USUAL = 1.0  # second: the interval of the tags
 BUSY = Refused("busy", code="06", refusal=Refusal.BUSY)
@@ -60,3 +61,14 @@ def test_a_write_to_a_busy_device_is_sent_at_once() -> None:
         rig.conclude(polled(rig), BUSY)
     rig.write("D0")
     assert isinstance(rig.next(), Write)
+
+
+def test_a_busy_device_is_left_alone_after_a_reload_too() -> None:
+    rig = Rig(link_device(retries=0))
+    rig.bring(State.ONLINE)
+    for _ in range(5):
+        rig.conclude(polled(rig), BUSY)
+    since = rig.now
+    change(rig, rig.device, late_guard=0.7)
+    polled(rig)
+    assert rig.now - since > 10.0

@@ -120,6 +120,27 @@ def test_bad_addresses_stay_known() -> None:
     assert len(new.bad_addresses.bad) == 2
 
 
+def test_a_search_for_silent_addresses_ends_although_the_file_is_read_again_within_it() -> None:
+    """Each round began with the whole block, and three time-outs (`hostile` seed 2700044)."""
+    rig = Rig(link_device(retries=1))
+    rig.bring(State.ONLINE)
+    assert len(rig.device.blocks) == 1
+    failures = 0
+    for _ in range(10):
+        for _ in range(3):
+            match rig.transacted():
+                case Probe() as job:
+                    rig.conclude(job, Resynced(1000))
+                case Poll(span=span) as job if span.start < 3 < span.start + span.size:
+                    failures += 1
+                    rig.fail(job)
+                case Poll() as job:
+                    rig.conclude(job, [0] * job.span.size)
+        change(rig, rig.device, late_guard=rig.device.settings.late_guard * 1.01)
+    assert failures == 4  # three until the first search, one until the second
+    assert len(rig.device.blocks) == 2
+
+
 def test_waiting_requests_to_a_changed_device_are_refused_and_others_are_not() -> None:
     rig = Rig(link_device(), link_device(station=2))
     first = rig.write("D0")

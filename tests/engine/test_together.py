@@ -10,6 +10,7 @@ from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle, Settle
 from gateway.engine.results.pipelining import PROOFS, TRY_AGAIN
 from gateway.protocols.modbus.drivers import ModbusTcp
 from tests.engine.rig import REPLIED, SILENCE, Rig, tcp_device
+from tests.engine.test_change import change
 from tests.sim.bench import WIRE
 
 
@@ -84,6 +85,14 @@ def test_it_is_tried_again_after_an_hour_once() -> None:
     sizes = transactions(rig, 5.0, every_one)
     assert max(sizes) == 4
     assert rig.device.diagnosis() == ""
+
+
+def test_a_device_with_other_settings_gets_one_at_a_time_as_before() -> None:
+    """After each reload requests went together, and were lost (`hostile` seed 2700042)."""
+    rig = Rig(busy_device())
+    transactions(rig, 5.0, first_only)
+    change(rig, rig.device, late_guard=0.7)
+    assert max(transactions(rig, 5.0, first_only)) == 1
 
 
 def test_a_block_that_is_never_answered_costs_no_window() -> None:

@@ -171,6 +171,41 @@ def test_an_interrupted_search_goes_on_in_the_halves_that_failed_too() -> None:
     assert bad.rejoin(SPLIT_FIRST)
 
 
+def test_a_search_that_is_dropped_goes_on_after_one_failure_of_the_whole_block() -> None:
+    """With reloads more often than a search takes, the whole block was tried for ever."""
+    found = words(*range(16))
+    (whole,), bad = found.blocks, found.bad_addresses
+    bad.refused(whole, 0, SILENT)
+    bad.abandon()
+    assert bad.is_suspect(whole)  # the engine halves it after one failure
+    bad.refused(whole, 0, SILENT)
+    assert bad.known().cuts == (("D", 8),)
+
+
+def test_a_changed_device_goes_on_with_the_searches_of_the_one_before() -> None:
+    old, new, other = words(*range(16)), words(*range(16)), words(*range(8))
+    (whole,) = old.blocks
+    old.bad_addresses.refused(whole, 0, SILENT)
+    new.take_over(old)
+    assert new.bad_addresses.is_suspect(whole)
+    other.take_over(old)
+    assert other.bad_addresses.clear  # it has no such block
+
+    again = words(*range(16))
+    for half in new.bad_addresses.refused(whole, 0, SILENT):
+        new.bad_addresses.read(half)
+    again.take_over(new)
+    for half in again.bad_addresses.refused(whole, 0, SILENT):
+        again.bad_addresses.read(half)
+    again.bad_addresses.settle(0.0)
+    assert again.bad_addresses.cuts == {("D", 8)}  # both times the halves were read
+    assert not again.bad_addresses.rejoin(0.0)
+    last = words(*range(16))
+    last.bad_addresses.restore(again.bad_addresses.known(), last.tags)
+    last.take_over(again)
+    assert last.bad_addresses.rejoin(SPLIT_FIRST)  # it does not begin again with each change
+
+
 def test_a_bad_address_in_a_faster_block_is_cut_off() -> None:
     """Its boundaries lie in a gap of the faster tags: they must be kept there too."""
     fast = [make_tag(f"D{n}", every=0.1) for n in (0, 1, 8, 9)]

@@ -2,9 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from gateway.engine.device.device import Device
 from gateway.tags import Tag
+
+Known = TypeVar("Known")
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +23,19 @@ class Changes:
     def left(self) -> list[Device]:
         """The devices that the engine forgets."""
         return [*self.removed, *(old for old, _ in self.replaced)]
+
+    def carry(self, known: dict[Device, Known]) -> None:
+        """Gives what is known of a device to the one in its place: it is the same station."""
+        for old, new in self.replaced:
+            if old in known:
+                known[new] = known[old]
+        for device in self.left:
+            known.pop(device, None)
+
+    def exchange(self, devices: set[Device]) -> None:
+        """Puts the devices that replace those of the set in their places."""
+        devices.update(new for old, new in self.replaced if old in devices)
+        devices.difference_update(self.left)
 
     def applied(self, devices: Sequence[Device]) -> list[Device]:
         """Returns the devices of the line after the changes."""

@@ -181,6 +181,7 @@ class Device:
         """Takes over the state of the same station. No request to it may be in flight."""
         self.health, self.record, self.use = old.health, old.record, old.use
         self.health.resyncs_elsewhere()
+        self.bad_addresses.take_over(old.bad_addresses, {block.span for block in self.blocks})
         self.good_reads.take_over(old.good_reads)
         self.one_at_a_time = old.one_at_a_time
         if self.settings.identity == old.settings.identity:

@@ -228,7 +228,7 @@ class PollEntry:
 
     def came_online(self, now: float) -> None:
         """Is due at once, because its device came online. Its values are bad."""
-        self.due, self.missed = now, 0
+        self.due, self.missed, self.tries = now, 0, 0
         self.device.record.recent.was_good(self.reads.at)
         self.reads.restart()
 

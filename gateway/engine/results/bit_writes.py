@@ -54,6 +54,5 @@ class BitWrites(Rule):
                 self._lacked_until[job.device] = now + LACKED_FOR
 
     def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
-        for device in changes.left:
-            self._lacked_until.pop(device, None)
-            self._proven.discard(device)
+        changes.carry(self._lacked_until)
+        changes.exchange(self._proven)

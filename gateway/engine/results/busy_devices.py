@@ -50,5 +50,4 @@ class BusyDevices(Rule):
         self._busy.clear()
 
     def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
-        for device in changes.left:
-            self._busy.pop(device, None)
+        changes.carry(self._busy)

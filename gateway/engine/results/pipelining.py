@@ -70,8 +70,7 @@ class Pipelining(Rule):
         self._ended_polls = 0
 
     def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
-        for device in changes.left:
-            self._windows.pop(device, None)
+        changes.carry(self._windows)
 
     def beside(self, poll: Poll, now: float) -> int:
         """Returns how many polls may be sent beside this one."""

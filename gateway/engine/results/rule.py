@@ -156,7 +156,7 @@ class Rules:
     def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         for rule in self.all:
             rule.change(changes, now, is_open=is_open)
-        self.troubled.difference_update(changes.left)
+        changes.exchange(self.troubled)
         self.select()
 
     def free_at(self, device: Device, now: float) -> float:

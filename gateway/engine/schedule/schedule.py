@@ -89,7 +89,7 @@ class Schedule:
             if known is None or known.ticket <= EXPEDITED:
                 poll = PollEntry(device, block, now, reads=reads)
             else:
-                poll = PollEntry(device, block, known.due, known.missed, reads)
+                poll = PollEntry(device, block, known.due, known.missed, reads, known.tries)
                 # The block may have been a bad address, which is polled rarely.
                 poll.due_by(now + poll.every)
             polls.append(poll)
