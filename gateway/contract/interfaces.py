@@ -204,6 +204,9 @@ class North(Protocol):
         `repeated`: the audit tells only an end that differs from the last one. Raises
         `GatewayError`."""
 
+    def deny_own(self, tag: Tag, value: Value | None, by: str, why: str) -> None:
+        """Audits a write that a part named `by` does not carry out."""
+
     async def write(
         self, tag: str, data: bytes, by: str, arrived: float
     ) -> WriteResult | Failure | GroupResult:

@@ -181,6 +181,10 @@ class Northbound:
         """Writes for a part named `by`, as `OwnWrites.write`."""
         return await self._incoming.own_writes.write(tag, value, by, within, repeated=repeated)
 
+    def deny_own(self, tag: Tag, value: Value | None, by: str, why: str) -> None:
+        """Audits a write of a part, as `OwnWrites.deny`."""
+        self._incoming.own_writes.deny(tag, value, by, why)
+
     @property
     def is_ready(self) -> bool:
         """True when the gateway serves its plant."""

@@ -140,6 +140,8 @@ async def opened(
         ) -> WriteResult:
             return await own.write(tag, value, by, within, repeated=repeated)
 
+        deny_own = staticmethod(own.deny)
+
     def keep(_at: int, event: str) -> None:
         outcomes.append(event.encode())
 
@@ -189,7 +191,13 @@ async def test_nothing_is_written_but_what_the_file_names() -> None:
         for pdu in ("06 0009 0001", "06 0014 0001", "10 0013 0002 04 0001 0002", "05 0008 ff00"):
             function = int(pdu[:2], 16)
             assert await program.ask(rtu(pdu)) == rtu(f"{function | 0x80:02x} 02")
-        assert hall.outcomes == []
+        said = [orjson.loads(outcome) for outcome in hall.outcomes]
+        assert [one["outcome"] for one in said] == 4 * ["not-writable"]
+        assert said[1]["by"] == "door laptop, 127.0.0.1"
+        assert (said[2]["value"], said[2]["reason"]) == (
+            [1, 2],
+            "`writes` of door laptop does not name it",
+        )
         [told] = hall.door.document(now())["programs"]
         assert (told["requests"], told["writes"], told["refused"]) == (4, 0, 4)
 
@@ -227,7 +235,7 @@ async def test_each_of_several_requests_in_one_packet_is_done() -> None:
         told = [asked[0], tcp("86 02", 4), asked[2]]
         assert await program.ask(b"".join(asked)) == b"".join(told)
         keys = [orjson.loads(outcome)["key"] for outcome in hall.outcomes[2:]]
-        assert [key.rpartition("-")[2] for key in keys] == ["11", "10"]
+        assert [key.rpartition("-")[2] for key in keys] == ["11", "255", "10"]  # 255: denied
 
 
 @on_virtual_time

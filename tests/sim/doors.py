@@ -354,6 +354,9 @@ class Life:
     ) -> WriteResult:
         return await self._own.write(tag, value, by, within, repeated=repeated)
 
+    def deny_own(self, tag: Tag, value: Value | None, by: str, why: str) -> None:
+        self._own.deny(tag, value, by, why)
+
     # Its work
 
     async def run(self) -> None:

@@ -152,6 +152,9 @@ class PlainNorth:
     ) -> WriteResult:
         raise AssertionError("the web writes for its clients only")
 
+    def deny_own(self, tag: Tag, value: Value | None, by: str, why: str) -> None:
+        raise AssertionError("the web writes for its clients only")
+
     async def order(
         self, part: str, path: str, data: bytes, by: str, arrived: float
     ) -> bytes | Failure:

@@ -187,6 +187,11 @@ class OwnWrites:
             tell(WriteOutcome(key, value, ended, time.time_ns(), took, by))
         return ended
 
+    def deny(self, tag: Tag, value: Value | None, by: str, why: str) -> None:
+        """Audits a write that is not carried out."""
+        key, ended = self._keys.value(tag.key), Failure(Problem.NOT_WRITABLE, why)
+        self._audit(WriteOutcome(key, value, ended, time.time_ns(), 0.0, by))
+
 
 @dataclass(eq=False)
 class PutWrites:

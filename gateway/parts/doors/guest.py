@@ -11,7 +11,6 @@ from gateway.parts.doors.documents import GuestDocument
 from gateway.parts.doors.guest_requests import NOT_NOW, Outcome, Unanswered
 from gateway.parts.doors.stores import Needs, Outcomes, Step
 from gateway.stations.served.answering import Heard
-from gateway.stations.store import Denied, Why
 from gateway.transport import Port
 
 if TYPE_CHECKING:
@@ -107,10 +106,11 @@ class Guest:
                 door.reads.note(step.device, run, loop.time())
             left = at + door.settings.reply_within - loop.time()
             outcome: Outcome
+            by = f"door {door.settings.name}, {self._address}"
             if step.writes and not self._may_write():
-                outcome = Denied(Why.NOT_ACCEPTED)
+                why = "its certificate has no role that may write"
+                outcome = door.turns.deny(step, by, why)
             elif left > 0:
-                by = f"door {door.settings.name}, {self._address}"
                 work = door.turns.carry_out(step, door.settings, by, left)
                 outcome = await asyncio.shield(door.start(work))
             else:

@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 
 from gateway.contract.interfaces import North
 from gateway.errors import BadValue, Busy, GatewayError, Offline, Refused, Unclear
@@ -115,9 +116,17 @@ class GuestRequests:
             found |= {(run.area, run.start + ahead): unit for ahead, unit in enumerate(units)}
         return found
 
+    def deny(self, step: Step, by: str, why: str) -> Denied:
+        """Audits a write that the door does not carry out."""
+        for run in step.runs():
+            with suppress(GatewayError):  # the device has no such address, or is gone
+                tag = self._any.target(step.device, run)
+                self._north.deny_own(tag, tag.from_units(step.units(run)), by, why)
+        return Denied(Why.NOT_ACCEPTED)
+
     async def _write(self, step: Step, door: Door, by: str, within: float) -> Outcome:
         if not all(door.may_write(step.device, *cell) for cell in step.cells):
-            return Denied(Why.NOT_ACCEPTED)
+            return self.deny(step, by, f"`writes` of door {door.name} does not name it")
         runs, done = [*step.runs()], 0
         tags = [self._any.target(step.device, run) for run in runs]  # before the first is sent
         values = [tag.from_units(step.units(run)) for run, tag in zip(runs, tags, strict=True)]
