@@ -119,7 +119,7 @@ class Transaction:
             if channel.quiet_since + device.silence.kept > started:
                 await channel.quiet(device.silence)
                 started = channel.now()
-            if self.has_sent:
+            if self.has_sent or self.traffic.heard:
                 self._begin_hearing()
             silence = started - channel.quiet_since
             if silence < self.traffic.silence:
