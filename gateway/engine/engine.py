@@ -144,7 +144,7 @@ class Engine:
             if good:  # units are the only good result of a poll
                 units = cast("Sequence[int]", result)
                 shapes, extra = job.device.shapes, traffic.extra > 0
-                if shapes is not None and (extra or shapes.quiet == WARY):
+                if shapes is not None and (extra or traffic.doubtful or shapes.quiet == WARY):
                     self._next_job.proofs.hold(HeldRead(entry, units, now, time), extra=extra)
                 else:
                     self._polls.read(entry, units, now, time)

@@ -152,9 +152,10 @@ class Transaction:
         traffic = self.traffic
         traffic.exchanges += 1
         own = answered - alone - busy
-        if request.equal:
+        too_soon = own < device.record.replies.soonest and device.shapes is not None
+        if too_soon or request.equal:
             unproven = started - channel.echo.absent_at
-            traffic.doubtful = device.may_be_echo(own, unproven)
+            traffic.doubtful |= too_soon or device.may_be_echo(own, unproven)
         if own > 0.0:
             traffic.turnaround += own
         return answer

@@ -8,6 +8,7 @@ from gateway.engine.device.identity import SILENT_FOR
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
 from gateway.engine.device.probe_pace import ALIVE_FOR, LATE_FOR, PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.records import QUICKEST_OF
 from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
 from gateway.engine.device.turnaround import LEARN_EVERY
@@ -53,6 +54,13 @@ BELIEFS = (
         f"{LEARN_EVERY} replies with another one",
         "forecasts and plans use the new one",
         LEARN_EVERY * 1.0,
+    ),
+    Belief(
+        "a reply cannot come sooner",
+        f"the quickest of {QUICKEST_OF} replies or more",
+        "a sooner one, which a resync proves",
+        "replies that are as quick need no proof",
+        AT_ONCE,
     ),
     Belief(
         "a shorter silence is enough",

@@ -9,6 +9,7 @@ import pytest
 from gateway.engine.device.health import FORGOTTEN, State
 from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
 from gateway.engine.device.probe_pace import PROBE_SPREAD
+from gateway.engine.device.records import QUICKEST_OF, Replies
 from gateway.engine.device.reply_shapes import ProofPace
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.requests import Write
@@ -62,6 +63,16 @@ def turnaround() -> Way:
         return (device.turnaround.expected or 0.0) > 0.2
 
     return given_up
+
+
+def quickest() -> Way:
+    replies = Replies()
+    for _ in range(int(HOUR)):
+        replies.count(0.01)
+    before = replies.soonest
+    assert 0.0 < before < 0.01
+    replies.count(0.004)
+    return lambda _: replies.soonest <= 0.002
 
 
 def rule_of(rig: Rig, kind: type[Any]) -> Any:
@@ -385,6 +396,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "the adapter echoes": lambda: echo(first=ASKED + SAID, then=SAID),
     "the adapter does not echo": lambda: echo(first=SAID, then=ASKED + SAID),
     "turnaround": turnaround,
+    "a reply cannot come sooner": quickest,
     "a shorter silence is enough": shorter_silence,
     "a silence is too short": silence_too_short,
     "answers twice": answers_twice,
@@ -428,3 +440,14 @@ def test_damaged_replies_are_a_sign_of_life() -> None:
     health.unclear(SILENCE, None, 60.0)
     health.gave_up(60.0, 1.0)
     assert health.probes.due >= 61.0
+
+
+def test_a_reply_comes_too_soon_only_after_many_and_with_the_true_baudrate() -> None:
+    replies = Replies()
+    for _ in range(QUICKEST_OF - 1):
+        replies.count(0.01)
+        assert replies.soonest < 0.0
+    replies.count(0.01)
+    assert replies.soonest == pytest.approx(0.005)
+    replies.count(0.0)  # the wire is faster than the file says
+    assert replies.soonest < -1.0

@@ -17,6 +17,7 @@ from tests.sim.plant import Plant, made_device
 from tests.sim.virtual import now
 
 GUARD = 0.5
+TURNAROUND = 0.005  # seconds of its PLC
 
 
 @dataclass
@@ -66,7 +67,7 @@ class DeviceServer(Bench):
                 await asyncio.sleep(arrives)
                 self.received(request)
                 arrives = 0.0
-            await asyncio.sleep(arrives + 0.005)
+            await asyncio.sleep(arrives + TURNAROUND)
             answers = [] if self.deaf_to(request) else self._station.hear(request, now())
             for answer in answers:
                 await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))

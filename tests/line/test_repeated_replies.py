@@ -18,7 +18,7 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from gateway.tags import Quality, Tag, WriteRule
-from tests.line.device_server import GUARD, DeviceServer, behind
+from tests.line.device_server import GUARD, TURNAROUND, DeviceServer, behind
 from tests.sim.bench import WIRE
 from tests.sim.plant import Plant, made_device, make_tag, running
 from tests.sim.virtual import now, on_virtual_time
@@ -90,6 +90,52 @@ async def test_no_value_moves_to_the_next_tag_after_a_repeated_reply(
         assert dev.state is State.ONLINE
         assert line.good(dev)
     assert wrong_values(line) == []
+
+
+@dataclass
+class Hasty(Repeater):
+    """Sends its copy with the next request, so many seconds before the station replies."""
+
+    sooner: float = 0.0
+    kept: bytes = b""
+
+    def received(self, data: bytes) -> None:
+        DeviceServer.received(self, data)
+        self.replies += 1
+        if self.replies in self.twice:
+            self.kept = data
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        if self.kept:
+            loop, copy, self.kept = asyncio.get_running_loop(), self.kept, b""
+            after = (len(data) + len(copy)) * WIRE.character + TURNAROUND - self.sooner
+            loop.call_later(after, DeviceServer.received, self, copy)
+
+
+@by_protocol
+@pytest.mark.parametrize(("sooner", "wrong"), [(0.6, 0), (0.45, 1)])
+@on_virtual_time
+async def test_a_reply_that_comes_sooner_than_the_station_can_reply_needs_a_proof(
+    driver: AnyDriver, sooner: float, wrong: int
+) -> None:
+    """Both blocks can only be read alone: the copy fits the next request. If it is not too soon,
+    the own reply is that for the request after it; `hostile` seed 2700067."""
+    server, area = Hasty(twice={160}, sooner=sooner * TURNAROUND), area_of(driver).strip(":")
+    tags = numbered(driver, 100, 200)
+    line, dev, memory = behind(server, driver, *tags)
+    for number in (100, 200):
+        memory.write(area, number, [number])
+    memory.holes = {(area, n) for n in range(300) if n not in (100, 200)}
+    async with running(line):
+        while server.replies <= 160:
+            await asyncio.sleep(0.1)
+        after = now()
+        await asyncio.sleep(20)
+    assert dev.shapes is not None
+    assert dev.shapes.is_wary
+    assert all(line.reads_of(tag, after) for tag in tags)
+    assert len(wrong_values(line)) <= wrong
 
 
 @dataclass

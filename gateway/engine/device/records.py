@@ -12,6 +12,7 @@ DAY = 86_400.0  # seconds
 MOST_FALLS = 1000  # times that are kept: one each 86 s of a day
 LATELY = 32  # requests whose ends are kept
 QUICKEST_OF = 50  # exchanges
+SOONER = 0.002  # seconds, at least, by which a reply comes sooner than the station can reply
 MOST_RESULTS = 20  # a modem that says noise does not fill the memory
 
 
@@ -191,6 +192,7 @@ class Replies:
 
     turnaround: float | None = None  # smoothed over about ten exchanges
     quickest: float = math.inf  # of many recent exchanges
+    soonest: float = -math.inf  # a reply that comes sooner may be another one
     _quickest_now: float = math.inf  # of those that are counted at present
     _counted: int = 0
 
@@ -199,9 +201,17 @@ class Replies:
         self.turnaround = own if known is None else known + 0.1 * (own - known)
         if own < self._quickest_now:
             self._quickest_now = own
+            self.soonest = min(self.soonest, _soonest(own))
         self._counted += 1
         if self._counted >= QUICKEST_OF:
             self.quickest, self._quickest_now, self._counted = self._quickest_now, math.inf, 0
+            self.soonest = _soonest(self.quickest)
+
+
+def _soonest(quickest: float) -> float:
+    """Returns the turnaround below which a reply comes too soon. Without any turnaround the wire
+    is faster than the file says, and nothing is known."""
+    return quickest - max(quickest / 2, SOONER) if quickest > 0.0 else -math.inf
 
 
 @dataclass(slots=True)

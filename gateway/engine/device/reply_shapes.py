@@ -26,7 +26,7 @@ SHOWN = 60.0  # seconds for which an extra reply explains the state of the devic
 INSIDE = 64  # units of a read inside a block, at most
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
-UNPROVEN = "extra replies arrive on this line, and nothing proves this read"
+UNPROVEN = "extra replies may arrive on this line, and nothing proves this read"
 
 
 @dataclass(slots=True)

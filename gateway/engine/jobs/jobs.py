@@ -203,7 +203,7 @@ class Traffic:
     extra: int = 0  # frames of the station that answered no request
     contradicted: bool = False  # one of them could be the reply to the last request, too
     silence: float = math.inf  # seconds before its request, the shortest of several
-    doubtful: bool = False  # an acknowledgement may be the echo of its request
+    doubtful: bool = False  # a reply may be another one, or the echo of its request
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Proofs: holds good reads of a line with extra replies until a resync shows that each is right."""
+"""Proofs: holds good reads that may be extra replies until a resync shows that each is right."""
 
 from collections.abc import Sequence
 
