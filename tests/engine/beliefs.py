@@ -185,7 +185,7 @@ BELIEFS = (
         "a station replies later than late_guard",
         "a reply of the station behind all requests",
         "a minute without one",
-        "a form that was requested in twice that time proves nothing",
+        "a second request whose form is unanswered waits for twice that time of quiet",
         LATE_FOR,
     ),
     Belief(

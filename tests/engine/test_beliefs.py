@@ -371,8 +371,8 @@ def later_than_its_guard() -> Way:
     health = link_device().health
     health.left_outstanding(None, HOUR)
     health.spoke(HOUR + 0.5, 1.0)
-    assert health.probes.may_answer_from(HOUR + 1.0) < HOUR + 1.0
-    return lambda after: health.probes.may_answer_from(HOUR + 0.5 + after) == HOUR + 0.5 + after
+    assert health.probes.lateness(HOUR + 1.0)
+    return lambda after: not health.probes.lateness(HOUR + 0.5 + after)
 
 
 def as_quick_as_before() -> Way:

@@ -523,7 +523,7 @@ def test_the_line_is_quiet_before_a_probe_that_may_have_an_older_reply_is_repeat
     assert "never quiet" in str(rig.device.health.trouble)
 
 
-def test_a_probe_of_a_station_that_is_too_late_is_not_repeated() -> None:
+def test_the_probe_of_a_late_station_is_repeated_when_its_form_is_old_enough() -> None:
     driver = ModbusRtu(station=1)
     tags = [make_tag(f"holding:{n}", driver, device="plc") for n in range(3)]
     rig = Rig(made_device("plc", driver, WIRE, driver.timing, tags))
@@ -533,11 +533,19 @@ def test_a_probe_of_a_station_that_is_too_late_is_not_repeated() -> None:
     probe = rig.transacted()
     assert rig.device.shapes is not None
     for size in (1, 2, 3):
-        rig.device.shapes.also_sent(driver.reply_shape(Span("holding", 0, size)), rig.now)
+        shape = driver.reply_shape(Span("holding", 0, size))
+        rig.device.shapes.also_sent(shape, rig.now)
+        rig.device.health.unanswered.seconds.append(shape)
     rig.device.health.probes.replied_behind(rig.now, 1.0)
     rig.conclude(probe, Resynced(0))
     settle = rig.transacted()
     assert isinstance(settle, Settle)
     rig.conclude(settle, Settled(None, quiet=True))
-    assert rig.device.health.needs_resync
-    assert "so late" in str(rig.device.health.trouble)
+    longer = rig.transacted()
+    assert isinstance(longer, Settle)
+    assert longer.gap == 2.0
+    rig.now += longer.gap
+    rig.conclude(longer, Settled(None, quiet=True))
+    again = rig.transacted()
+    assert isinstance(again, Probe)
+    assert again.again

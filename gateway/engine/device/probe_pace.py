@@ -66,10 +66,10 @@ class ProbePace:
             self._late_by = 0.0
         self._late_by, self._late_seen = max(self._late_by, min(took, LATE_MOST)), now
 
-    def may_answer_from(self, now: float) -> float:
-        """Returns the time of the first request that may still be answered: twice as old as the
-        latest reply of the last minute was late."""
-        return now - 2 * self._late_by if now - self._late_seen < LATE_FOR else now
+    def lateness(self, now: float) -> float:
+        """Returns the seconds in which a request may still be answered: twice as long as the latest
+        reply of the last minute was late; 0: none was."""
+        return 2 * self._late_by if now - self._late_seen < LATE_FOR else 0.0
 
     def spoke(self, now: float, longest_reply: float) -> None:
         """Notes a sound frame while it was offline: it replies later than a short probe waits."""

@@ -34,7 +34,6 @@ from gateway.engine.schedule.in_flight import InFlight
 from gateway.errors import (
     BadValue,
     DeviceError,
-    Evidence,
     Garbled,
     LineDown,
     NoReply,
@@ -44,7 +43,6 @@ from gateway.errors import (
 )
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
-TOO_LATE = "its replies are so late that this one may belong to an earlier request"
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
 
 
@@ -230,7 +228,7 @@ class NextJob:
                 device.health.inherit(inherits=False)
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
-                self._repeat(after, now, time)
+                self._repeat(after, now)
             return
         short = _is_short(after)
         late = result.late if isinstance(result, Settled) and not short else None
@@ -252,14 +250,12 @@ class NextJob:
             elif device.health.needs_resync and not isinstance(after, Identify):
                 self._in_flight.owe(device)
 
-    def _repeat(self, probe: Probe, now: float, time: int) -> None:
-        """Lets the second request of a resync follow."""
-        token = second_token(probe.device, probe.outstanding, probe.token + 1, now)
-        if token is None:
-            too_late = Garbled(TOO_LATE, evidence=Evidence.SLOW)
-            self.unclear(probe, too_late, Traffic(), now, time)
-        else:
-            self._in_flight.follow(Probe(probe.device, probe.outstanding, token, again=True))
+    def _repeat(self, probe: Probe, now: float) -> None:
+        """Lets the second request of a resync follow, or more quiet before it."""
+        device, outstanding = probe.device, probe.outstanding
+        token, quiet = second_token(device, outstanding, probe.token + 1, now)
+        following = Probe(device, outstanding, token, again=True)
+        self._in_flight.follow(Settle(device, 2 * quiet, quiet, probe) if quiet else following)
 
     def abandon(self, error: LineDown | None, now: float) -> None:
         """Ends the job, because the port was lost or the gateway stops."""

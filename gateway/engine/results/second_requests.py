@@ -2,8 +2,8 @@
 
 A station later than `late_guard` may still reply to earlier requests. So the second request reads
 the form that was requested longest ago. One without a reply is remembered: its form is none of the
-row of resyncs, from which a reply is told otherwise. A station that was later than that is not
-asked: each form may still be the reply to an earlier request.
+row of resyncs, from which a reply is told otherwise. Where a station was later than that, the
+line is quiet until an earlier second request with this form can no longer be answered.
 """
 
 import math
@@ -15,25 +15,30 @@ MOST_SILENT = 2  # second requests without a reply, until only the first choice 
 MOST_TOKENS = 32  # among which the second request of a resync is chosen
 
 
-def second_token(device: Device, outstanding: Span | None, token: int, now: float) -> int | None:
+def second_token(
+    device: Device, outstanding: Span | None, token: int, now: float
+) -> tuple[int, float]:
     """Returns the token of a second request: the one whose form was requested longest ago.
 
-    `token`: the first choice, also where no read inside the spans has another form, or the device
-    is silent about it. None: a request of this form may still be answered.
+    With it the seconds for which the wire must be quiet before, because an earlier second request
+    with this form may still be answered; 0: for no longer. `token`: the first choice, also where no read inside the spans has another form, or the device
+    is silent about it.
     """
-    shapes, spans = device.shapes, device.probe_spans
+    shapes, spans, health = device.shapes, device.probe_spans, device.health
     if shapes is None or now < shapes.proofs.seconds_from:
-        return token
+        return token, 0.0
     inside = shapes.inside(spans, outstanding)
     found, longest_ago = token, math.inf
     for one in (PROOF, *range(token, token + MOST_TOKENS)):
         shape = shapes.of_resync(outstanding, one, spans)
         if shape in inside and (at := shapes.used_at(shape)) < longest_ago:
             found, longest_ago = one, at
-    if device.health.probes.may_answer_from(now) < longest_ago < math.inf:
-        return None
+    lateness = health.probes.lateness(now)
+    unanswered = shapes.of_resync(outstanding, found, spans) in health.unanswered.seconds
+    if unanswered and now - longest_ago < lateness:
+        return found, lateness
     device.note_resync(outstanding, found, now)
-    return found
+    return found, 0.0
 
 
 def leave_second(device: Device, outstanding: Span | None, token: int, now: float) -> None:
