@@ -56,7 +56,10 @@ async def test_a_recording_tells_the_values_of_the_live_run() -> None:
         learned = [one for one in replay.run(log) if isinstance(one, Learned)]
         values = sum(isinstance(entry, LoggedValue) for entry in log)
         assert values > 50
-        assert replay.checked == Checked(equal=values)
+        # A reply that equals the one to the read before counts for nothing: the next one does.
+        missing = replay.checked.missing
+        assert replay.checked == Checked(equal=values - missing, missing=missing)
+        assert missing <= values // 50
         known = {sample.tag.key for one in learned for sample in one.samples}
         assert known >= {entry.tag for entry in log if isinstance(entry, LoggedValue)}
     recipes = [
