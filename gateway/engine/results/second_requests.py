@@ -21,8 +21,8 @@ def second_token(
     """Returns the token of a second request: the one whose form was requested longest ago.
 
     With it the seconds for which the wire must be quiet before, because an earlier second request
-    with this form may still be answered; 0: for no longer. `token`: the first choice, also where no read inside the spans has another form, or the device
-    is silent about it.
+    with this form may still be answered; 0: for no longer. `token`: the first choice, also where no
+    read inside the spans has another form, or the device is silent about it.
     """
     shapes, spans, health = device.shapes, device.probe_spans, device.health
     if shapes is None or now < shapes.proofs.seconds_from:
