@@ -186,8 +186,11 @@ class DeviceServer:
         said = station.hear(data, now)
         if said is not None and not request:
             self._wire.watch.answered(data, said[0])
+        if said is None:  # that of another station takes no time of this one
+            self._wire.at(now, partial(self._ask_held, station))
+            return
         ends = now + len(data) * character
-        if said is not None and said[0]:
+        if said[0]:
             ends = now + said[1] + len(said[0]) * character
             self._wire.at(ends, partial(self.pass_on, said[0]))
         self._wire.at(ends + self._rest, partial(self._ask_held, station))
