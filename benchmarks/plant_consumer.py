@@ -36,7 +36,7 @@ _AGES_EVERY = 1.0
 
 def is_right(number: int, value: float, at: float) -> bool:
     """`number`: of the tag in its device. `at`: its time stamp, on the monotonic clock."""
-    period = 20.0 + 7 * (number % 11)
+    period = 60.0 + 7 * (number % 11)
     middle = at - _READ / 2
     expected = _MIDDLE + _HALF * math.sin(2 * math.pi * middle / period + number)
     steepest = _HALF * 2 * math.pi / period

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from gateway.parts.alarms.own_faults import FAULTS
 from tests.attacks.security_pages import (
     RULES,
     VALUES,
@@ -193,7 +194,8 @@ async def reads(person: ZenohPeer, rights: Rights) -> None:
         ("plant/@gateway/demo/@describe", 1),
         ("plant/@gateway/*/@introspect", 1),
         (f"{STATUS[:-6]}audit/*?_time=[now(-1h)..]", 0),  # the file keeps none
-        (f"{ALARMS}/**", 5),  # of a tag, two devices and two lines
+        # Of a tag, two devices, two lines, and the faults of the gateway itself.
+        (f"{ALARMS}/**", 5 + len(FAULTS)),
         ("plant/mixer/speed?max_age=1h", 1),
         ("**", 0),
     ):
