@@ -28,7 +28,7 @@ class _Known:
 
     @cached_property
     def texts(self) -> Sequence[str]:
-        """What a search looks at."""
+        """The key and the description of each tag in lower case, for a search."""
         return [f"{tag.key} {tag.label.description}".lower() for tag in self.tags]
 
     @cached_property
