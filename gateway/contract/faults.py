@@ -105,6 +105,7 @@ def coded_warnings(documents: Documents) -> Iterator[Fault]:
     for line, document in below("lines/", documents):
         yield from _of_line(line, document, documents, unreachable)
     yield from _of_others(documents["status"])
+    yield from _of_group(documents.get("standby", {}))
     yield from _held_up(documents, unreachable)
     reload = documents.get("reload", {})
     if reload.get("refused"):
@@ -189,6 +190,14 @@ def _of_others(status: Document) -> Iterator[Fault]:
             "be old and look good"
         )
         yield Fault("answered-elsewhere", text, "status")
+
+
+def _of_group(standby: Document) -> Iterator[Fault]:
+    active = standby.get("stand") == "active"
+    if active and not {*standby["others_waiting"], *standby["others_active"]}:
+        group = standby["group"]
+        text = f"no other gateway of group {group} waits: none takes over when this one fails"
+        yield Fault("no-standby", text, "standby")
 
 
 def causes(documents: Documents) -> dict[str, tuple[list[str], list[str]]]:

@@ -255,5 +255,17 @@ def test_one_cause_on_one_line_is_one_fault(healthy: dict[str, Any]) -> None:
 def test_a_healthy_standby_has_no_fault(healthy: dict[str, Any]) -> None:
     documents = changed(healthy, "lines/hall", open=False, trouble="", down_for=None, losses=0)
     assert list(faults(documents)) == ["line hall is down: not opened yet"]
-    documents["standby"] = {"group": "hall", "stand": "waiting", "others_active": 1}
+    standby = {"group": "hall", "stand": "waiting", "others_active": ["a"], "others_waiting": []}
+    documents["standby"] = standby
     assert list(faults(documents)) == []
+    assert list(warnings(documents)) == []
+
+
+def test_an_active_gateway_without_a_standby_says_so(healthy: dict[str, Any]) -> None:
+    standby = {"group": "hall", "stand": "active", "others_active": []}
+    healthy["standby"] = {**standby, "others_waiting": ["b"]}
+    assert list(warnings(healthy)) == []
+    healthy["standby"] = {**standby, "others_waiting": []}
+    assert list(warnings(healthy)) == [
+        "no other gateway of group hall waits: none takes over when this one fails"
+    ]

@@ -75,14 +75,18 @@ def gateway(folder: Path, name: str, router: str, port: int, listen: Sequence[st
     return Program(sys.executable, "-c", RUN, "run", file)
 
 
-async def until_states(client: ZenohPeer, stands: str) -> None:
-    """Waits until a and b report these states; their documents lag a little."""
+async def until_states(client: ZenohPeer, **stands: str) -> None:
+    """Waits until these gateways, and no others, report these states, and the active one sees who
+    waits. Their documents lag a little."""
+    waiting = [name for name, stand in stands.items() if stand == "waiting"]
     async with asyncio.timeout(300):
         while True:
             replies = await client.get("plant/@gateway/*/standby")
-            found = {reply.key: reply.json["stand"] for reply in replies if reply.key}
-            if [found.get(f"plant/@gateway/{name}/standby") for name in "ab"] == stands.split():
-                return
+            found = {str(reply.key).split("/")[2]: reply.json for reply in replies if reply.key}
+            if {name: one["stand"] for name, one in found.items()} == stands:
+                active = next(one for one in found.values() if one["stand"] == "active")
+                if active["others_waiting"] == waiting:
+                    return
 
 
 async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
@@ -94,7 +98,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
             async with ZenohPeer("client", connect=[router_at]) as client:
                 # Both start at once: the first by name goes.
                 await line.until(1, within=15)
-                await until_states(client, "active waiting")
+                await until_states(client, a="active", b="waiting")
                 # One answers for the plant, and takes its writes; both say that they are there.
                 replies = await client.get("plant/mixer/speed", consolidation="NONE")
                 assert len(replies) == 1
@@ -104,7 +108,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                 await router.kill()
                 async with ZenohPeer("router", listen=[router_at]):
                     await asyncio.sleep(SETTLE_TIME + CLAIM_TIME + 1)
-                    await until_states(client, "active waiting")
+                    await until_states(client, a="active", b="waiting")
                     assert (line.open, line.most) == (1, 1)
                     # A crash. The values of the next one are later than those of the first.
                     values = await client.subscribe("plant/mixer/speed")
@@ -114,11 +118,12 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     await line.until(1, within=3)
                     next_one = await values.next(lambda s: s.json["reason"] == "starting")
                     assert next_one.json["time"] > crashed
+                    await until_states(client, b="active")
                     # The gateway that comes back is standby until the other one ends.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
-                    await until_states(client, "waiting active")
+                    await until_states(client, a="waiting", b="active")
                     await asyncio.sleep(CLAIM_TIME + 1)
-                    await until_states(client, "waiting active")
+                    await until_states(client, a="waiting", b="active")
                     assert await asyncio.to_thread(b.end) == 0
                     await line.until(1, within=3)
                     assert line.most == 1

@@ -91,9 +91,18 @@ def test_a_token_found_by_a_query_counts_for_a_limited_time() -> None:
 def test_own_tokens_are_ignored_but_those_of_an_earlier_session_count() -> None:
     election = alone()
     election.token_changed(RoleToken(Role.ACTIVE, "a", "s1"), True)
-    assert election.others_active() == []
+    assert election.others(Role.ACTIVE) == []
     election.token_changed(RoleToken(Role.ACTIVE, "a", "s0"), True)
-    assert election.others_active() == ["a"]
+    assert election.others(Role.ACTIVE) == ["a"]
+
+
+def test_a_waiting_gateway_is_seen_and_decides_nothing() -> None:
+    election, waiting = alone(), RoleToken(Role.WAITING, "0", "s0")
+    election.token_changed(waiting, True)
+    until(election, State.ACTIVE, 0.0, 20.0)
+    assert election.others(Role.WAITING) == ["0"]
+    election.token_changed(waiting, False)
+    assert election.others(Role.WAITING) == []
 
 
 def test_without_a_needed_link_it_waits_for_ever() -> None:

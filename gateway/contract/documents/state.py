@@ -236,6 +236,7 @@ class StandbyDocument(TypedDict):
     group: str
     stand: Literal["waiting", "claiming", "active", "relieved"]
     others_active: list[str]
+    others_waiting: list[str]
 
 
 class ClaimDocument(TypedDict):

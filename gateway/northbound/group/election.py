@@ -4,7 +4,7 @@ Each gateway declares a liveliness token in the role *claim* before it becomes a
 the role *active* while it is; the others see these tokens a moment later. A gateway that sees no
 other active token claims, waits for `CLAIM_TIME`, and only then becomes active. If two claim, the
 first by name continues. This holds as long as a token travels in less than half of `CLAIM_TIME`;
-docs/standby.md explains a split network.
+docs/standby.md explains a split network. A standby gateway has a token in the role *waiting*.
 
 Synchronous; does no I/O. All times are seconds of one monotonic clock.
 """
@@ -29,6 +29,7 @@ class Role(StrEnum):
 
     CLAIM = "claim"
     ACTIVE = "active"
+    WAITING = "waiting"  # decides nothing: the others see that a gateway could replace them
 
 
 class State(StrEnum):
@@ -168,9 +169,9 @@ class Election:
     def waits_for_link(self) -> bool:
         return self.state is State.STANDBY and not self._links.are_up
 
-    def others_active(self) -> list[str]:
-        """Names of the other gateways with an active token."""
-        return sorted(token.name for token in self._tokens if token.role is Role.ACTIVE)
+    def others(self, role: Role) -> list[str]:
+        """Names of the other gateways with a token of this role."""
+        return sorted(token.name for token in self._tokens if token.role is role)
 
     def _may_claim(self, now: float) -> bool:
         if self._seen(Role.ACTIVE) or self._seen(Role.CLAIM, before_me=True):

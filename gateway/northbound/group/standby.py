@@ -25,7 +25,11 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 _DECIDE_EVERY = 0.2  # seconds
 _QUERY_TIMEOUT = 0.4  # seconds
 _DECISIONS_WITHOUT_LINK = 15  # until the missing link is logged
-_TOKENS = {State.CLAIMING: (Role.CLAIM,), State.ACTIVE: (Role.CLAIM, Role.ACTIVE)}
+_TOKENS = {
+    State.STANDBY: (Role.WAITING,),
+    State.CLAIMING: (Role.CLAIM,),
+    State.ACTIVE: (Role.CLAIM, Role.ACTIVE),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +74,15 @@ class Standby:
         """The status document; none without a standby group."""
         if not self.enabled:
             return {}
-        state = State.STANDBY if self._election is None else self._election.state
-        others = [] if self._election is None else self._election.others_active()
-        return {"standby": {"group": self._name, "stand": state.value, "others_active": others}}
+        election = self._election
+        return {
+            "standby": {
+                "group": self._name,
+                "stand": (State.STANDBY if election is None else election.state).value,
+                "others_active": [] if election is None else election.others(Role.ACTIVE),
+                "others_waiting": [] if election is None else election.others(Role.WAITING),
+            }
+        }
 
     async def run(self, session: zenoh.Session, second: SecondSession) -> None:
         """Runs until cancelled. `session` is the gateway's own; the tokens are in `second`. Raises
@@ -158,12 +168,12 @@ class Standby:
         if session is None or state is State.REPLACED:
             return  # replaced: the token stays until the lines are really closed
         wanted = _TOKENS.get(state, ())
-        for role in [role for role in self._tokens if role not in wanted]:
-            await off_loop(self._tokens.pop(role).undeclare)
         for role in wanted:
             if role not in self._tokens:
                 key = self._group.key(RoleToken(role, self._keys.gateway, election.session))
                 self._tokens[role] = await off_loop(session.liveliness().declare_token, key)
+        for role in [role for role in self._tokens if role not in wanted]:
+            await off_loop(self._tokens.pop(role).undeclare)
 
     def _query_tokens(self, session: zenoh.Session, replies: Inbox[zenoh.Reply]) -> None:
         """Queries the tokens besides subscribing to them, so that one lost message does no

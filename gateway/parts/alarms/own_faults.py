@@ -25,6 +25,7 @@ FAULTS = {
     "disk-fills": ("the disk of the history is full soon", Priority.MEDIUM),
     "door-closed": ("a door is closed", Priority.MEDIUM),
     "answered-elsewhere": ("another program answers queries of this gateway", Priority.MEDIUM),
+    "no-standby": ("no other gateway of the standby group waits", Priority.MEDIUM),
     "file-not-back": ("the remote file did not go back", Priority.MEDIUM),
 }
 
