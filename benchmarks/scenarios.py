@@ -25,9 +25,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.start import free_ports
 from benchmarks.transactions import has_modbus_serial
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import free_endpoint, free_port
 
 HERE = Path(__file__).parents[1]
 PAGE = HERE / "docs" / "scenarios.md"
@@ -229,7 +228,7 @@ def running(
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         path, record, endpoint = folder / "plant.yaml", folder / "record", free_endpoint()
-        port = free_ports(scenario.lines)
+        port = free_port(scenario.lines)
         path.write_text("\n".join(file(scenario, endpoint, port)) + "\n")
         sizes = (scenario.lines, scenario.units, scenario.tags)
         slaves = Program(slave, port, *sizes, scenario.kind, int(changing), scenario.baud, record)
@@ -363,7 +362,7 @@ def measured_peer(
 ) -> dict[str, Any]:
     """Measures another program that reads the same slaves, and publishes nothing."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        port, sizes = free_ports(scenario.lines), (scenario.lines, scenario.units, scenario.tags)
+        port, sizes = free_port(scenario.lines), (scenario.lines, scenario.units, scenario.tags)
         record = Path(folder) / "record"
         slaves = Program(slave, port, *sizes, scenario.kind, int(changing), 0, record)
         stack.callback(slaves.stop)

@@ -15,20 +15,19 @@ import argparse
 import json
 import os
 import random
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
 import zenoh
 
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import free_endpoint, free_port
 
 INTERVALS = ("1s", "5s", "30s")
 KINDS = ("alike", "different")
@@ -100,18 +99,6 @@ def checked(tree: Path, path: Path) -> Taken:
         raise SystemExit(f"check ended with {program.returncode}")
     taken = time.monotonic() - begun
     return Taken("check", taken, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024)
-
-
-def free_ports(count: int) -> int:
-    """Returns the first of so many free TCP ports in a row."""
-    places: list[int] = [*range(21000, 31000, count)]
-    random.shuffle(places)  # another benchmark may be taking some
-    for first in places:
-        with ExitStack() as stack, suppress(OSError):
-            for port in range(first, first + count):
-                stack.enter_context(socket.create_server(("127.0.0.1", port)))
-            return first
-    raise SystemExit(f"no {count} free ports in a row")
 
 
 @contextmanager
@@ -203,7 +190,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for kind in KINDS if arguments.only is None else (arguments.only,):
             endpoint, path = free_endpoint(), Path(folder) / f"{kind}.yaml"
-            first = free_ports(sizes.lines) if arguments.apart else 0
+            first = free_port(sizes.lines) if arguments.apart else 0
             text = rows(sizes, endpoint, alike=kind == "alike", first_port=first)
             path.write_text("\n".join(text) + "\n")
             with stations(path) if first else nullcontext():

@@ -14,7 +14,6 @@ import contextlib
 import logging
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -42,6 +41,7 @@ from gateway.tags import Sample, Tag
 from gateway.tags.mirror import Mirror
 from gateway.transport import Port, Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from gateway.transport.loop import new_event_loop
+from tests.zenoh_peer import free_port
 
 INTEROP = Path(__file__).parent.parent / "tests" / "interop"
 WORDS, FIRST = 64, 100
@@ -175,13 +175,6 @@ def compiled(folder: Path, name: str) -> Path | None:
     program = folder / name
     subprocess.run(["cc", "-O2", INTEROP / f"{name}.c", "-o", program, *flags], check=True)
     return program
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 @contextlib.contextmanager

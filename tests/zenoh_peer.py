@@ -66,13 +66,22 @@ def _own_ports() -> "itertools.cycle[int]":
     raise AssertionError("every block of ports belongs to another process")
 
 
-def free_port() -> int:
-    """Returns a free port of the loopback that this process has not used recently."""
-    for port in _own_ports():
-        with socket.socket() as probe, suppress(OSError):
-            probe.bind(("127.0.0.1", port))
-            return port
-    raise AssertionError("the ports never end")
+def free_port(neighbours: int = 1) -> int:
+    """Returns a free port of the loopback that this process has not used recently; the first of
+    so many neighbours."""
+    assert neighbours < BLOCK, "the ports of this process are fewer"
+    ports = _own_ports()
+    while True:
+        found = [next(ports) for _ in range(neighbours)]
+        if found[-1] - found[0] == neighbours - 1 and all(map(_is_free, found)):
+            return found[0]
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe, suppress(OSError):
+        probe.bind(("127.0.0.1", port))
+        return True
+    return False
 
 
 def free_endpoint() -> str:
@@ -269,6 +278,19 @@ class ZenohPeer:
                 for reply in await self.get(selector):
                     if fits(reply.json):
                         return reply.json
+                await asyncio.sleep(POLL)
+
+    async def get_all_until(
+        self, selector: str, fit: Callable[[dict[str, Any]], bool]
+    ) -> dict[str, Any]:
+        """Waits until the documents by key fit, and returns them: those of tags that were not read
+        yet say so."""
+        async with asyncio.timeout(TIMEOUT):
+            while True:
+                replies = await self.get(selector, consolidation="NONE")
+                found = {reply.key: reply.json for reply in replies if reply.key is not None}
+                if fit(found):
+                    return found
                 await asyncio.sleep(POLL)
 
     async def many(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gateway.cli.config.demo import free_port
 from tests.e2e.processes import Program, until
+from tests.zenoh_peer import free_port as unused_port
 
 
 def test_one_command_shows_a_page_with_values_and_leaves_nothing(tmp_path: Path) -> None:
@@ -30,8 +31,8 @@ def test_one_command_shows_a_page_with_values_and_leaves_nothing(tmp_path: Path)
 
 
 def test_a_port_that_is_taken_is_replaced_by_a_free_one() -> None:
+    taken = unused_port()
     with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        taken = other.getsockname()[1]
+        other.bind(("127.0.0.1", taken))
         assert free_port(taken) not in (taken, 0)
     assert free_port(taken) == taken

@@ -13,8 +13,7 @@ from gateway.protocols.modbus import ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.transport import SerialSettings
 from tests.conftest import Command
-from tests.e2e.processes import PATIENCE, station
-from tests.e2e.test_first_plant import three_free_ports
+from tests.e2e.processes import PATIENCE, free_port, station
 
 SERIAL = SerialSettings(19200, "7E1")
 
@@ -65,7 +64,7 @@ def test_mistakes_are_found_before_the_line_is_scanned(command: Command, tmp_pat
 def test_it_asks_on_a_terminal_and_names_the_mistakes_of_the_sheet(tmp_path: Path) -> None:
     """The whole dialogue at a real terminal: a wrong file name, then a sheet with a mistake."""
     (tmp_path / "tags.csv").write_text("Name,Address\nspeed,D100\nlevel,D99999\n")
-    number = three_free_ports()
+    number = free_port()
     path = tmp_path / "plant.yaml"
     answers = [f"tcp://127.0.0.1:{number}", "vigor", "", "hall-2", "all", "mixer", "tag.csv"]
     answers.append(str(tmp_path / "tags.csv"))

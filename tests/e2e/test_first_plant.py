@@ -3,7 +3,6 @@
 import re
 import shlex
 import signal
-import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -14,7 +13,7 @@ import pytest
 
 from tests.e2e.processes import gateway, plc_gateway, started, until
 from tests.test_docs import EXAMPLE, _blocks, shape
-from tests.zenoh_peer import free_endpoint
+from tests.zenoh_peer import free_endpoint, free_port
 
 PAGE = "first-plant.md"
 [FILE] = [block.text for block in _blocks(PAGE) if block.language == "yaml"]
@@ -37,19 +36,6 @@ def steps(page: str = PAGE) -> Iterator[Step]:
                     yield Step(shlex.split(command)[1:], shown)
 
 
-def three_free_ports() -> int:
-    """The first of three neighbouring free ports."""
-    while True:
-        with ExitStack() as stack:
-            first = stack.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1]
-            try:
-                for port in (first + 1, first + 2):
-                    stack.enter_context(socket.create_server(("127.0.0.1", port)))
-            except (OSError, OverflowError):
-                continue
-        return int(first)
-
-
 def normal(line: str) -> str:
     """The shape of a line, with its columns separated by one space."""
     return " ".join(shape(line).split())
@@ -58,7 +44,7 @@ def normal(line: str) -> str:
 @pytest.fixture(name="ports")
 def _ports() -> dict[str, str]:
     """Replaces the ports of the page by free ones."""
-    first = three_free_ports()
+    first = free_port(3)
     replaced = {f"127.0.0.1:{FIRST_PORT + i}": f"127.0.0.1:{first + i}" for i in range(3)}
     return replaced | {"tcp/127.0.0.1:7447": free_endpoint(), "config.example.yaml": str(EXAMPLE)}
 

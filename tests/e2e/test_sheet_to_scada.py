@@ -8,14 +8,14 @@ from pathlib import Path
 
 from gateway.config import load
 from tests.e2e.processes import ROOT, gateway, plc_gateway, started, until
-from tests.e2e.test_first_plant import Step, normal, steps, three_free_ports
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.e2e.test_first_plant import Step, normal, steps
+from tests.zenoh_peer import ZenohPeer, free_endpoint, free_port
 
 PAGE = "sheet-to-scada.md"
 
 
 def test_a_sheet_of_300_tags_is_on_zenoh_after_five_commands(tmp_path: Path) -> None:
-    first = three_free_ports()
+    first = free_port(3)
     replaced = {f"127.0.0.1:{4001 + i}": f"127.0.0.1:{first + i}" for i in range(3)}
     replaced |= {name: str(ROOT / name) for name in ("config.example.yaml", "examples/tags.csv")}
 

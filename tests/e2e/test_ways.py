@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -99,10 +100,8 @@ async def test_values_arrive_and_writes_are_done(
         for name in ("speed", "level", "batches"):
             await _wait_for_a_change(samples, f"plant/mixer/{name}")
 
-        replies = await client.get("plant/mixer/**", consolidation="NONE")
-        values = {reply.key: reply.json for reply in replies}
+        values = await client.get_all_until("plant/mixer/**", _are_good)
         assert set(values) == {f"plant/mixer/{name}" for name in TAGS}
-        assert {value["quality"] for value in values.values()} == {"good"}
         assert isinstance(values["plant/mixer/level"]["value"], float)
         assert isinstance(values["plant/mixer/door"]["value"], bool)
         assert values["plant/mixer/name"]["value"] == "SIMULATED"
@@ -123,6 +122,15 @@ def _shows(name: str, value: object, sample: Received) -> bool:
     return sample.key == f"plant/mixer/{name}" and bool(sample.json["value"] == value)
 
 
+def _are_good(values: dict[str, Any]) -> bool:
+    return {value["quality"] for value in values.values()} == {"good"}
+
+
 async def _wait_for_a_change(samples: Subscription, key: str) -> None:
-    first = await samples.next(lambda s: s.key == key and s.json["quality"] == "good")
-    await samples.next(lambda s: s.key == key and s.json["value"] != first.json["value"])
+    """Waits for another good value: the first sample of a gateway that starts is null."""
+
+    def is_good(sample: Received) -> bool:
+        return sample.key == key and bool(sample.json["quality"] == "good")
+
+    first = await samples.next(is_good)
+    await samples.next(lambda s: is_good(s) and s.json["value"] != first.json["value"])

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from gateway.stations.station import Memory
 from tests.sim.virtual import VirtualLoop
+from tests.zenoh_peer import free_port as free_port
 
 T = TypeVar("T")
 PATIENCE = 300.0  # seconds; reached only by a failing test
@@ -88,12 +89,6 @@ def listening(backlog: int = 5) -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0), backlog=backlog) as server:
         server.setblocking(False)
         yield server
-
-
-def free_port() -> int:
-    with listening() as server:
-        number: int = server.getsockname()[1]
-    return number
 
 
 class FixedStation:
