@@ -46,7 +46,7 @@ from gateway.parts.notify.outbox import Outbox
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from gateway.tags.tag import READ
-from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
+from tests.e2e.processes import ROOT, Program, plc_gateway, started, until, until_exit
 from tests.zenoh_peer import free_endpoint, free_port
 
 README = ROOT / "README.md"
@@ -123,7 +123,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with started(path) as program:
         for _ in range(3):
             program.says("device online")
-        until(lambda: plc_gateway("read", path).code == 0, "every value is good")
+        until_exit(0, plc_gateway, "read", path)
         yield path
 
 

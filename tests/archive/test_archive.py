@@ -211,4 +211,4 @@ def test_a_clock_that_was_ahead_hides_no_delay(command: Command, tmp_path: Path)
     begun = Cursor("plant/@gateway/demo")
     store.add([], begun, replace(begun, after="demo:1f.a0-1-2", whole=ahead))
     shown = command("archive", "status", tmp_path / "archive", "--json")
-    assert json.loads(shown.out)["behind"] is None
+    assert shown.json["behind"] is None

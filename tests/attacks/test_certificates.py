@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import json
 import os
 import signal
 import socket
@@ -85,7 +84,7 @@ def test_gateway_and_clients_know_each_other_by_their_certificates(
         # A session of Zenoh with the certificate of the client.
         file.write_text(file.read_text().replace("plant/gateway.", "plant/scada."))
         health = command("health", "--json", file)
-        assert json.loads(health.out)["name"] == "demo"
+        assert health.json["name"] == "demo"
 
 
 def _plant(folder: Path, days: int) -> tuple[Path, Path]:
@@ -132,7 +131,7 @@ def _days(status: Done) -> float:
     """How long both certificates are valid, 0 while the gateway starts over and says nothing."""
     if not status.out:
         return 0
-    found = json.loads(status.out)
+    found = status.json
     settings = ("certificate", "lines.boiler.tls.certificate")
     return min(float(found[f"certificates/{setting}"]["days"]) for setting in settings)
 

@@ -43,7 +43,7 @@ def test_each_damaged_file_is_a_fault_until_it_is_removed(command: Command, tmp_
             return str(line.split()[-1])
 
     def damaged() -> set[str]:
-        documents = json.loads(command("status", "--json", file).out)
+        documents = command("status", "--json", file).json
         return {Path(one).name for one in documents["damaged"]["files"]}
 
     asides = {f"{name}.bad" for name in FILES}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.config import load
-from tests.e2e.processes import plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import plc_gateway, started, until_exit, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 TAGS = {
@@ -37,8 +37,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = write_config(folder / "config.yaml", free_endpoint(), lines)
     with started(path) as program:
         program.says("device online")
-        while plc_gateway("read", path).code:
-            pass  # until the first values arrive
+        until_exit(0, plc_gateway, "read", path)
         yield path
 
 

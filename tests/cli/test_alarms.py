@@ -1,7 +1,6 @@
 """The command `alarms` at a running gateway: shelving, and what its lists show."""
 
 import io
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ def test_an_alarm_is_shelved_listed_and_put_back(running: Path, command: Command
     assert re.fullmatch(f"mixer: {shelved}", told(*shelve))
     [row] = command("alarms", running).out.splitlines()[1:]
     assert re.fullmatch(rf"mixer +high +shelved .*{shelved}\s*", row)
-    [document] = json.loads(command("alarms", running, "--json").out)
+    [document] = command("alarms", running, "--json").json
     assert document["shelved"]["reason"] == "being repaired"
     assert re.search(r"^alarms +1 shelved *$", command("status", running).out, re.MULTILINE)
     assert told("--unshelve", "mixer") == "mixer: normal"

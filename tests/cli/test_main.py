@@ -156,7 +156,7 @@ def test_a_folder_instead_of_a_file_ends_with_2(command: Command, tmp_path: Path
 
 def test_schema_prints_the_schema(command: Command) -> None:
     done = command("schema")
-    assert (done.code, json.loads(done.out)) == (0, config_schema())
+    assert (done.code, done.json) == (0, config_schema())
 
 
 def test_the_version_is_an_option_and_a_command(command: Command) -> None:
@@ -198,7 +198,7 @@ def test_the_documents_of_commands_have_the_schemas_of_the_contract(
     fit("write", *said("write", running, "mixer/trim", "3"))
     fit("group", *said("write", running, "mixer", "trim=3", "offset=1"))
     fit("status", *said("health", running))
-    fit("alarm", *json.loads(command("alarms", running, "--all", "--json").out))
+    fit("alarm", *command("alarms", running, "--all", "--json").json)
     [status] = said("status", running)
     for path, document in status.items():
         fit(path.partition("/")[0], document)
@@ -232,4 +232,4 @@ def test_health_prints_the_status(command: Command, running: Path) -> None:
     assert command("health", running).out.endswith(": it answers\n")
     done = command("health", "--json", running)
     assert done.code == 0
-    assert json.loads(done.out)["devices"] == {"mixer": "up"}
+    assert done.json["devices"] == {"mixer": "up"}

@@ -2,7 +2,6 @@
 
 import copy
 import io
-import json
 import re
 import signal
 import socket
@@ -17,7 +16,14 @@ from gateway.cli.status import view
 from gateway.contract.faults import faults, warnings
 from gateway.contract.line_faults import span
 from tests.conftest import Command
-from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import (
+    gateway,
+    plc_gateway,
+    started,
+    until_exit,
+    vigor_line,
+    write_config,
+)
 from tests.web.serving import calling, transfer
 from tests.zenoh_peer import free_endpoint
 
@@ -27,13 +33,6 @@ TO_MIXER = {"from": "mixer/a", "to": "mixer:D1..D9"}
 def device_on(port: str, name: str) -> dict[str, Any]:
     line = vigor_line(port, {"level": {"address": "D10"}}, reply_timeout="50ms", retries=0)
     return {**line, "devices": {name: line["devices"]["mixer"]}}
-
-
-def until_exit(command: Command, code: int, *arguments: object) -> Done:
-    """Runs a command until it ends with this code; the test's own time-out bounds it."""
-    while (done := command(*arguments)).code != code:
-        pass
-    return done
 
 
 def test_a_healthy_gateway(command: Command, running: Path) -> None:
@@ -49,7 +48,7 @@ def test_a_healthy_gateway(command: Command, running: Path) -> None:
 
 
 def test_as_json_it_is_every_document(command: Command, running: Path) -> None:
-    documents = json.loads(command("status", "--json", running).out)
+    documents = command("status", "--json", running).json
     assert documents["status"]["devices"] == {"mixer": "up"}
     assert documents["lines/hall"]["open"] is True
     assert documents["devices/mixer"]["station"] == 1
@@ -67,15 +66,15 @@ def test_what_is_wrong_is_said_and_fails(command: Command, tmp_path: Path) -> No
         config = write_config(tmp_path / "c.yaml", free_endpoint(), lines, history=history)
         program = stack.enter_context(started(config))
         program.says("device offline", "pump")
-        until_exit(command, 0, "write", config, "mixer/trim", "5")
-        done = until_exit(command, 1, "status", config)
+        until_exit(0, command, "write", config, "mixer/trim", "5")
+        done = until_exit(1, command, "status", config)
         assert f"line yard is down: {tmp_path / 'no-port'}: no such port" in done.out
         assert re.search(r"pump is silent: .*power", done.out)
         assert "oven" not in done.out[done.out.index("wrong:") :]  # its line says why
         assert re.search(r"^writes +1 written in the last hour", done.out, re.MULTILINE)
         strict = command("health", "--strict", "--json", config)
         assert strict.code == 1
-        assert json.loads(strict.out)["devices"]["mixer"] == "up"
+        assert strict.json["devices"]["mixer"] == "up"
         assert strict.err.splitlines()[0].startswith("line yard is down:")
         assert command("health", config).code == 0  # it is there
 
@@ -92,7 +91,7 @@ def test_watch_follows_and_shows_a_gateway_that_has_gone(tmp_path: Path) -> None
 
 @pytest.fixture(scope="module")
 def healthy(running: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(plc_gateway("status", "--json", running).out)
+    found: dict[str, Any] = plc_gateway("status", "--json", running).json
     return found
 
 

@@ -12,7 +12,7 @@ from gateway.config import load
 from gateway.errors import GatewayError
 from tests.cli.conftest import TAGS, documents
 from tests.conftest import Command
-from tests.e2e.processes import started, until, vigor_line, write_config
+from tests.e2e.processes import started, until, until_exit, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 
@@ -59,7 +59,7 @@ def test_write_prints_the_reply_of_the_plc(
     assert done.out.endswith(" ms\n")
 
     def is_read() -> bool:  # a slow machine may miss a reply
-        [row] = documents(command("read", running, tag, "--json", "--max-age", "0s").out)
+        row = command("read", running, tag, "--json", "--max-age", "0s").json
         return str(row["value"]) == value.replace("true", "True")
 
     until(is_read, f"{tag} is {value}")
@@ -92,9 +92,8 @@ def test_a_gateway_that_hangs_does_not_get_the_write(command: Command, tmp_path:
             with pytest.raises(GatewayError, match="nothing was sent"):
                 client.requests.write("mixer/trim", 2)
         os.kill(program.pid, signal.SIGCONT)
-        while (read := command("read", path, "mixer/trim", "--json", "--max-age", "0s")).code:
-            pass  # it goes on
-        assert [row["value"] for row in documents(read.out)] == [1]
+        read = until_exit(0, command, "read", path, "mixer/trim", "--json", "--max-age", "0s")
+        assert read.json["value"] == 1
 
 
 @pytest.mark.parametrize(

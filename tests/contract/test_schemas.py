@@ -119,7 +119,7 @@ def test_a_gateway_says_what_it_permits() -> None:
 
 
 def test_the_command_prints_the_schemas(command: Command) -> None:
-    assert json.loads(command("schema", "--contract").out) == COMMITTED
+    assert command("schema", "--contract").json == COMMITTED
 
 
 # -- a running plant -------------------------------------------------------------------------------

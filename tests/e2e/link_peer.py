@@ -14,6 +14,7 @@ import sys
 
 from tests.protocols.computer_link_peer import Peer
 
+ENQ = b"\x05"
 PAUSE = 0.02  # seconds without a byte that end a request in format 1
 
 
@@ -30,7 +31,9 @@ class Plc:
         self._request += os.read(self.port, 4096)
         while select.select([self.port], [], [], PAUSE)[0]:
             self._request += os.read(self.port, 4096)
-        request, self._request = self._request, b""
+        # A request that comes while this process had no time ends the one before.
+        _, enq, last = self._request.rpartition(ENQ)
+        request, self._request = enq + last, b""
         answer = self._answer(request)
         if answer and not self.mute:
             os.write(self.port, answer)

@@ -34,6 +34,12 @@ class Done(NamedTuple):
     out: str
     err: str
 
+    @property
+    def json(self) -> Any:
+        """The document that it printed."""
+        assert self.out, self
+        return json.loads(self.out)
+
 
 def plc_gateway(*arguments: object, **how: Any) -> Done:
     """Runs a command to its end. `cwd`; `env`: variables besides those of this process."""
@@ -49,6 +55,18 @@ def plc_gateway(*arguments: object, **how: Any) -> Done:
     )
     assert "Traceback" not in done.stderr, done.stderr
     return Done(done.returncode, done.stdout, done.stderr)
+
+
+def until_exit(code: int, run: Callable[..., Done], *arguments: object) -> Done:
+    """Runs a command until it ends with this code: a gateway may start, and have no values yet."""
+    last: list[Done] = []
+
+    def ends() -> bool:
+        last[:] = [run(*arguments)]
+        return last[0].code == code
+
+    until(ends, f"{arguments} ends with {code}")
+    return last[0]
 
 
 class Program:

@@ -3,7 +3,6 @@
 PLC, cable, gateway and Zenoh client are processes of their own.
 """
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -34,21 +33,25 @@ class Oven(NamedTuple):
     config: Path
 
 
-@pytest.fixture(params=[1, 4], ids=["format 1", "format 4"])
-def oven(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Oven]:
+# One plant for all: each test sets a temperature of its own.
+@pytest.fixture(scope="module", params=[1, 4], ids=["format 1", "format 4"])
+def oven(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Oven]:
     socat, endpoint = needs("socat"), free_endpoint()
-    near, far = tmp_path / "near", tmp_path / "far"
+    folder = tmp_path_factory.mktemp("oven")
+    near, far = folder / "near", folder / "far"
     device = {
         "protocol": "computer-link",
         "station": 5,
         "frame_format": request.param,
-        "reply_timeout": "300ms",
+        "reply_timeout": "1s",
         "monitor": True,
         "control": True,
         "tags": TAGS,
     }
     line = {"port": str(near), "baudrate": 19200, "format": "7E1", "devices": {"oven": device}}
-    config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line})
+    config = write_config(folder / "config.yaml", endpoint, {"hall": line})
     with ExitStack() as stack:
         stack.enter_context(cable(socat, near, f"pty,raw,echo=0,link={far}"))
         module = sys.executable, "-m", "tests.e2e.link_peer"
@@ -94,8 +97,8 @@ async def test_values_and_writes(oven: Oven) -> None:
 async def test_a_plc_that_loses_its_list_and_sends_unsolicited_frames(oven: Oven) -> None:
     async with ZenohPeer("client", connect=[oven.endpoint]) as client:
         heard = await client.subscribe("plant/oven/*")
-        oven.plc.tell("set D0100 215")
-        await heard.next(lambda s: s.json.get("value") == 21.5)
+        oven.plc.tell("set D0100 216")
+        await heard.next(lambda s: s.json.get("value") == 21.6)
         assert {"MB", "MN"} & set(oven.plc.tell("heard").split())
         oven.plc.tell("say 7777")
         assert "on-demand data of station 5: 7777" in oven.gateway.says("stray frame")
@@ -114,8 +117,8 @@ async def test_a_bad_address_and_an_offline_plc(oven: Oven) -> None:
         heard = await client.subscribe("plant/oven/*")
         oven.plc.tell("gone D0500")
         await heard.next(lambda s: s.key.endswith("setpoint") and s.json.get("reason") == "refused")
-        oven.plc.tell("set D0100 215")
-        await heard.next(lambda s: s.json.get("value") == 21.5)
+        oven.plc.tell("set D0100 217")
+        await heard.next(lambda s: s.json.get("value") == 21.7)
         [refused] = await client.get("plant/oven/setpoint/@set", b"1")
         assert not refused.ok
         assert (refused.json["error"], refused.json["code"]) == ("refused", "06")
@@ -124,16 +127,16 @@ async def test_a_bad_address_and_an_offline_plc(oven: Oven) -> None:
             lambda s: s.key.endswith("temperature") and s.json.get("reason") == "no-reply"
         )
         oven.gateway.says("device offline", "6306", "D8121")
-        oven.plc.tell("speak")
         heard.forget()
-        await heard.next(lambda s: s.json.get("value") == 21.5, timeout=20)
+        oven.plc.tell("speak")
+        await heard.next(lambda s: s.json.get("value") == 21.7)
 
 
 async def test_control(command: Command, oven: Oven) -> None:
     async with ZenohPeer("client", connect=[oven.endpoint]) as client:
         heard = await client.subscribe("plant/oven/*")
-        oven.plc.tell("set D0100 215")
-        await heard.next(lambda s: s.json.get("value") == 21.5)
+        oven.plc.tell("set D0100 218")
+        await heard.next(lambda s: s.json.get("value") == 21.8)
         [model] = await client.get("plant/oven/@model")
         assert model.json["answer"] == "9D (FX2N)"
         [loopback] = await client.get("plant/oven/@loopback", b"HELLO")
@@ -151,10 +154,11 @@ async def test_control(command: Command, oven: Oven) -> None:
     assert done.code == 0
     until(lambda: oven.plc.tell("get M8126") == "0", "the flag changes")
     done = command("control", oven.config, "oven", "loopback", "HI", "--json")
-    assert (done.code, {*json.loads(done.out)}) == (0, {"answer", "time", "took"})
+    assert (done.code, {*done.json}) == (0, {"answer", "time", "took"})
     oven.plc.tell("mute")
     done = command("control", oven.config, "oven", "model", "--json")
-    assert (done.code, json.loads(done.out)["error"]) == (1, "no-reply")
+    # A poll may fail first: the command waits for the device, which stays silent.
+    assert (done.code, done.json["error"] in ("no-reply", "busy")) == (1, True), done
 
 
 def _read(document: dict[str, object]) -> bool:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import pytest
 
 from gateway.cli.main import main
-from tests.e2e.processes import PATIENCE, ROOT, gateway, plc_gateway, started, until
+from tests.e2e.processes import PATIENCE, ROOT, gateway, plc_gateway, started, until, until_exit
 from tests.test_docs import EXAMPLE, TEXT, _blocks
 from tests.zenoh_peer import free_endpoint, free_port
 
@@ -206,6 +206,6 @@ def test_every_command_of_a_tutorial_works(
                     file_of.write_text(f"zenoh: {{listen: [{free_endpoint()}]}}\n{made}")
                 case "run":
                     stack.enter_context(started(file_of))
-                    until(lambda: plc_gateway("read", file_of).code == 0, "every value is good")
+                    until_exit(0, plc_gateway, "read", file_of)
                 case _:
                     print(shell(words))

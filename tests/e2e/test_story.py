@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from typing import NamedTuple
 import pytest
 import yaml
 
-from tests.e2e.processes import Program, plc_gateway, started, until
+from tests.e2e.processes import Program, plc_gateway, started, until, until_exit
 from tests.northbound.access import GATEWAY_RULES, certificates, secret
 from tests.test_docs import ENDPOINT, EXAMPLE, Block, _blocks, shape
 from tests.zenoh_peer import free_endpoint
@@ -43,17 +42,13 @@ def set_up(folder: Path, zenoh: dict[str, object], client: str) -> Iterator[Stor
         yield Story(folder, path)
 
 
-def every_value_is_good(path: Path) -> bool:
-    return plc_gateway("read", path).code == 0
-
-
 @pytest.fixture(scope="module")
 def beginning(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
     endpoint = free_endpoint()
     assert OPEN.count(ENDPOINT) == 1
     client = OPEN.replace(ENDPOINT, endpoint)
     for story in set_up(tmp_path_factory.mktemp("story"), {"listen": [endpoint]}, client):
-        until(partial(every_value_is_good, story.config), "every value is good")
+        until_exit(0, plc_gateway, "read", story.config)
         yield story
 
 

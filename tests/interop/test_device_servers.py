@@ -1,7 +1,6 @@
 """Device servers that connect to the gateway, with pymodbus's server behind each of them."""
 
 import asyncio
-import json
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -72,7 +71,7 @@ async def test_two_sites_call_in_at_one_port_and_come_back_after_every_loss(
     server = (sys.executable, HERE / "pymodbus_server.py", "rtu", "tcp", str(slave))
 
     def read(tag: str) -> object:
-        return json.loads(plc_gateway("read", file, tag, "--json").out)["value"]
+        return plc_gateway("read", file, tag, "--json").json["value"]
 
     async with running(*server, ready=b"ready"):
         with await asyncio.to_thread(started, file) as gateway:

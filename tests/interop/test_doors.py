@@ -130,5 +130,5 @@ def _is(value: int, document: Any) -> bool:
 
 def _doors(file: Path) -> list[dict[str, Any]]:
     done = plc_gateway("status", file, "--json")
-    documents = json.loads(done.out)
+    documents = done.json
     return [one for path, one in documents.items() if path.startswith("doors/")]

@@ -303,7 +303,7 @@ async def test_direct_commands_read_and_write_a_slave(
         config = write_config(tmp_path / "config.yaml", free_endpoint(), {"hall": line})
         call = asyncio.to_thread
         done = await call(plc_gateway, "write", config, "plc/n", "77", "--direct", "--json")
-        assert (done.code, json.loads(done.out)["value"]) == (0, 77)
+        assert (done.code, done.json["value"]) == (0, 77)
         done = await call(plc_gateway, "read", config, "--direct", "--json")
         rows = {row["tag"]: row for row in map(json.loads, done.out.splitlines())}
         assert (rows["plc/n"]["value"], rows["plc/third"]["value"]) == (77, True)

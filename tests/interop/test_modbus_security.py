@@ -1,7 +1,6 @@
 """Modbus/TCP Security beside pymodbus: its servers are asked, and its client asks, over TLS."""
 
 import asyncio
-import json
 import ssl
 from pathlib import Path
 from typing import Any, cast
@@ -128,8 +127,8 @@ async def test_the_role_of_a_program_says_if_it_may_write_at_a_door(tmp_path: Pa
         assert await reader.read() == b""
         writer.close()
         done = await asyncio.to_thread(plc_gateway, "status", file, "--json")
-        assert json.loads(done.out)["doors/raw"]["turned_away"] == 1
-        assert "certificates/share.doors.raw.tls.certificate" in json.loads(done.out)
+        assert done.json["doors/raw"]["turned_away"] == 1
+        assert "certificates/share.doors.raw.tls.certificate" in done.json
         assert gateway.end() == 0
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from gateway.cli.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
 from tests.conftest import Command
-from tests.e2e.processes import PATIENCE, Done, started, vigor_line, write_config
+from tests.e2e.processes import PATIENCE, Done, started, until_exit, vigor_line, write_config
 from tests.northbound.access import (
     GATEWAY_RULES,
     PASSWORDS,
@@ -123,17 +123,16 @@ def test_the_command_line_has_the_rights_of_its_user(
     typed: Typed, closed: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
 ) -> None:
     with closed(tmp_path) as path:
-        while typed("viewer", "read", path).code:
-            pass  # the first values are on their way
+        until_exit(0, typed, "viewer", "read", path)
         assert json.loads(watched("viewer", path))["quality"] == "good"
         assert typed("operator", "write", path, "mixer/recipe", "7").code == 0
         done = typed("operator", "read", path, "mixer/recipe", "--json", "--max-age", "0s")
-        assert (done.code, json.loads(done.out)["value"]) == (0, 7)
+        assert (done.code, done.json["value"]) == (0, 7)
         done = typed("viewer", "write", path, "mixer/recipe", "8")
         assert (done.code, done.out) == (1, "")
         assert "nothing was sent; may viewer do this, and does the gateway run" in done.err
         # Enough for a container, and no more.
-        assert json.loads(typed("health", "health", path, "--json").out)["name"] == "demo"
+        assert typed("health", "health", path, "--json").json["name"] == "demo"
         done = typed("health", "read", path)
         assert (done.code, done.out) == (1, "")
         assert "no reply: " in done.err
@@ -173,9 +172,8 @@ def test_at_a_router_the_user_of_the_gateway_may_check_its_health_only(
     tmp_path: Path,
 ) -> None:
     with closed_by_a_router(tmp_path) as path:
-        while (done := typed(None, "health", path, "--json")).code:
-            pass  # the router learns of the gateway
-        assert json.loads(done.out)["name"] == "demo"
+        done = until_exit(0, typed, None, "health", path, "--json")  # the router learns of it
+        assert done.json["name"] == "demo"
         done = typed(None, "read", path)
         assert (done.code, done.out) == (1, "")
         assert "may gateway query it?" in done.err
