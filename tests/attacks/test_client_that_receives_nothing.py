@@ -9,7 +9,7 @@ from tests.e2e.processes import started, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 DEAF = Path(__file__).with_name("deaf_client.py")
-PATIENCE = 90.0  # seconds; about 10 on an idle machine
+PATIENCE = 300.0  # seconds; about 10 on an idle machine
 TAGS, WIDE, NARROW = 2000, 60, 2000  # together more than the system takes for a link
 
 

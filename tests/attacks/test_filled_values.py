@@ -49,7 +49,7 @@ async def test_a_filled_value_turns_bad_with_its_source_and_returns_with_it(tmp_
                 assert await master.ask(HELD) == GOOD  # `hold_last` says so
                 assert await master.ask("03 0003 0001") == "03 02 00 09"
                 server.speaking.add(1)
-                async with asyncio.timeout(60):
+                async with asyncio.timeout(300):
                     while await master.ask(READ) != GOOD:
                         await asyncio.sleep(0.05)
                 await master.close()

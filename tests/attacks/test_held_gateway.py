@@ -9,11 +9,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from gateway.line.arrival import HELD
-from gateway.line.send_permit import SETTLE
 from gateway.northbound.group.election import LONGEST_PAUSE
 from tests.attacks.tcp_peer import peer, tcp_reply
 from tests.e2e.processes import Program, free_port, started, station, vigor_line, write_config
-from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, TIMEOUT, ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
 HOLD = HELD + 0.3  # seconds
@@ -38,7 +37,7 @@ def held(program: Program) -> Iterator[None]:
 
 async def until_taken(client: ZenohPeer, payload: bytes) -> None:
     """Writes until the gateway has forgotten its hold."""
-    async with asyncio.timeout(10 * SETTLE):
+    async with asyncio.timeout(TIMEOUT):
         while not (await client.get(RECIPE, payload))[0].ok:
             await asyncio.sleep(POLL)
 

@@ -41,9 +41,7 @@ async def test_questions_for_fresh_values_leave_a_fast_tag_its_time(tmp_path: Pa
             ZenohPeer("client", connect=[endpoint]) as curious,
         ):
             values = await client.subscribe("plant/**", advanced=True)
-            await values.until(
-                lambda of: sum(map(is_good, of.latest().values())) > len(slow), timeout=30.0
-            )
+            await values.until(lambda of: sum(map(is_good, of.latest().values())) > len(slow))
             before = await reads(client)
             await asyncio.sleep(SECONDS)
             alone = await reads(client) - before

@@ -9,7 +9,6 @@ from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.line.send_permit import SETTLE
 from tests.e2e.processes import (
     Program,
     free_port,
@@ -20,7 +19,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import POLL, ZenohPeer, free_endpoint
+from tests.zenoh_peer import POLL, TIMEOUT, ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
 
@@ -217,6 +216,6 @@ async def test_a_gateway_that_was_frozen_keeps_its_device_when_it_wakes(tmp_path
         assert await asyncio.to_thread(b.ended) == 1
         assert b.has_said("gateway left serves every device of this file already")
         await p.until_alive("left/alive/mixer")
-        async with asyncio.timeout(10 * SETTLE):  # so long it refuses what may be of the past
+        async with asyncio.timeout(TIMEOUT):  # so long it refuses what may be of the past
             while not (await p.client.get(RECIPE, b"7", target="ALL"))[0].ok:
                 await asyncio.sleep(POLL)

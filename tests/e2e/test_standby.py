@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.processes import Program, free_port, station
+from tests.e2e.processes import Program, free_port, slowed, station
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only the longest wait is shorter, so that the suite is.
@@ -46,7 +46,7 @@ class Wire:
 
     async def until(self, count: int, within: float) -> None:
         """Waits until the number of connections is `count`."""
-        async with asyncio.timeout(within):
+        async with asyncio.timeout(slowed(within)):
             while self.open != count:
                 self.changed.clear()
                 await self.changed.wait()

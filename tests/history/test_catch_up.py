@@ -149,7 +149,7 @@ class SlowHistory:
 
     def _answer(self, time_range: str, now: int, found: list[T]) -> Iterator[T]:
         self.asked.setdefault(time_range, []).append(now)
-        assert self.go.wait(20)
+        assert self.go.wait(300)
         return iter(found)
 
 

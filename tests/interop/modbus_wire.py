@@ -13,7 +13,7 @@ from gateway.protocols.driver import AnyDriver
 from gateway.stations.station import Station
 
 T = TypeVar("T")
-PATIENCE = 5.0  # seconds; no peer here takes so long
+PATIENCE = 10.0  # seconds, the most that mbpoll takes; no peer here takes so long
 
 
 class Bytes(asyncio.Protocol):

@@ -16,7 +16,7 @@ from gateway.config import load
 from gateway.errors import LineDown
 from gateway.transport import SerialPath, SerialSettings, open_port
 from gateway.transport.rs485 import Rs485
-from tests.transport.ends import PtyMaster, RecordingReceiver
+from tests.transport.ends import PATIENCE, PtyMaster, RecordingReceiver
 
 BAUD = 9600
 CHARACTER = 10 / BAUD  # seconds
@@ -58,7 +58,7 @@ def plug() -> Iterator[PtyMaster]:
 
 
 async def until(rts: Rts, switches: int) -> None:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE):
         while len(rts.times) < switches:
             await asyncio.sleep(0.001)
 
@@ -91,7 +91,7 @@ async def test_a_driver_that_fails_meanwhile_ends_the_line(rts: Rts, plug: PtyMa
     port = await open_port(SerialPath(plug.path), settings, receiver)
     rts.gone = True
     port.write(b"request")
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE):
         while not receiver.losses:
             await asyncio.sleep(0.001)
     assert "cannot send: Input/output error" in str(receiver.losses[0])

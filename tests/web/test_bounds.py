@@ -89,7 +89,7 @@ class SlowHistory:
         self.gate = threading.Event()
 
     def samples(self, *_: object) -> Iterator[Sample]:
-        self.gate.wait(60)
+        self.gate.wait(300)
         return iter(())
 
 
