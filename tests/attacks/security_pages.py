@@ -72,6 +72,7 @@ TAGS = {
 OVEN = {
     "protocol": "computer-link",
     "station": 5,
+    "reply_timeout": "2s",  # also for a machine that stands still for a moment
     "blocks": True,
     "tags": {"dial": {"address": "D0100", "write": True}},
 }
@@ -86,7 +87,7 @@ def plant_file(
     `control`: the oven takes commands.
     """
     lines = {
-        "hall": vigor_line("simulator", TAGS),
+        "hall": vigor_line("simulator", TAGS, reply_timeout="2s"),
         "annex": {"port": "simulator", "devices": {"oven": OVEN | {"control": control}}},
     }
     rest = {"gateway": {"name": "demo"}, "lines": lines, "defaults": {"every": "200ms"}}

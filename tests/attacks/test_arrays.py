@@ -73,8 +73,9 @@ async def _there_and_back(endpoint: str) -> None:
 
         past = await client.get("plant/mixer/recipe?_time=[now(-1m)..]")
         good = [sample.json["value"] for sample in past if sample.json["quality"] == "good"]
-        assert good == [list(range(100, 150)), new]
+        # All values are put again some time after the link of a client, also within the deadband.
+        assert good in ([list(range(100, 150)), new], [list(range(100, 150)), new, one_less])
         buckets = await client.get("plant/mixer/recipe?_time=[now(-1m)..];bucket=1h")
-        assert sum(bucket.json["good"] for bucket in buckets) == 2
+        assert sum(bucket.json["good"] for bucket in buckets) == len(good)
         assert {bucket.json["mean"] for bucket in buckets} == {None}
-        assert buckets[-1].json["last"] == new
+        assert buckets[-1].json["last"] == good[-1]
