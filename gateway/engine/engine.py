@@ -143,9 +143,9 @@ class Engine:
             entry = in_flight.open.pop(job)
             if good:  # units are the only good result of a poll
                 units = cast("Sequence[int]", result)
-                shapes, extra = job.device.shapes, traffic.extra > 0
-                if shapes is not None and (extra or traffic.doubtful or shapes.quiet == WARY):
-                    self._next_job.proofs.hold(HeldRead(entry, units, now, time), extra=extra)
+                shapes, doubtful = job.device.shapes, traffic.extra > 0 or traffic.doubtful
+                if shapes is not None and (doubtful or shapes.quiet == WARY):
+                    self._next_job.proofs.hold(HeldRead(entry, units, now, time), traffic)
                 else:
                     self._polls.read(entry, units, now, time)
             else:

@@ -168,7 +168,7 @@ class Carrier:
         elif rule.every is None and row.at >= 0.0 and not (row.instead or row.early):
             if row.sure and value == row.written and not row.tried:
                 judge.broke(f"{name} carried {value!r} twice")
-            elif judge.now - row.at < row.source.every - LOOP:
+            elif not row.tried and judge.now - row.at < row.source.every - LOOP:
                 judge.broke(f"{name} carried two values in {judge.now - row.at:.3f} s")
             elif row.changed_at < row.at:
                 judge.broke(f"{name} carried {value!r} again, but the source did not change")

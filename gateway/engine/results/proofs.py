@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from gateway.engine.device.device import Device
 from gateway.engine.device.reply_shapes import SHOWN, UNPROVEN
 from gateway.engine.jobs.jobs import Probe, Result, Settle, Traffic
+from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.schedule.in_flight import HeldRead, InFlight
@@ -13,13 +14,16 @@ from gateway.errors import Refused, Unsteady
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
 LONGEST = 0.5  # seconds: then reads get their proof
+# A reply is late from this turnaround on, in seconds, and from so many times the usual one.
+LATE, SLOWER = 0.02, 3.0
 
 
 class Proofs:
     """Holds reads of one device, and has one resync prove them.
 
     If another reply was taken for that to a read, the own one is outstanding. It arrives before
-    that to the resync, as one too many. So one resync proves all reads since the one before.
+    that to the resync, as one too many. So one resync proves all reads since the one before. It
+    proves nothing where the own reply may never come: see `_may_be_alone`.
     """
 
     def __init__(
@@ -30,12 +34,14 @@ class Proofs:
         self._results = results
         self._polls = polls
 
-    def hold(self, read: HeldRead, *, extra: bool) -> None:
-        """Holds the values of a good read. `extra`: an extra reply arrived with its own."""
+    def hold(self, read: HeldRead, traffic: Traffic) -> None:
+        """Holds the values of a good read."""
         device, now = read.poll.device, read.now
         self._in_flight.hold(read)
-        if extra:
+        if traffic.extra:
             self._results.answered_twice(device, now, read.time)
+        if _may_be_alone(read.poll, traffic):
+            self._in_flight.doubt()
         self._go_on(device, [read], now)
 
     def refused(self, device: Device, now: float) -> None:
@@ -98,3 +104,16 @@ class Proofs:
                 self._polls.read(*read)
             else:
                 self._polls.unsteady(read.poll, Unsteady(UNPROVEN), now, time)
+
+
+def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
+    """Returns True if the reply may be an earlier one, and no own reply may follow it.
+
+    An earlier reply with this shape may arrive once more. The station had no reply to this read
+    last time, or it replies much sooner otherwise.
+    """
+    shapes, usual = poll.device.shapes, poll.device.usual_turnaround
+    if shapes is None or not shapes.collided:
+        return False
+    late = usual is not None and traffic.turnaround > max(LATE, SLOWER * usual)
+    return late or poll.missed > 0
