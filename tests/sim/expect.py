@@ -88,7 +88,7 @@ class Expectations:
             every = self.every(bus, device, tag)
             limit = 2 * load * every + 2 * (len(bus.line.engine.devices) + 2) * longest + 1.0
             if tag.span.area == LISTENED:
-                if episode.kind in ("stall", "held-requests"):
+                if episode.kind in ("stall", "held-requests", "reset"):
                     continue  # unsolicited frames continue
                 limit = 10 * every + 2 * longest + 1.0
             if isinstance(bus.wire, SimNet) and any(

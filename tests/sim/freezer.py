@@ -9,11 +9,12 @@ import asyncio
 from collections.abc import Callable
 from contextvars import Context, ContextVar, copy_context
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from gateway.transport import Receiver
 from tests.sim.virtual import VirtualLoop
 
+_T = TypeVar("_T")
 _GATEWAY: ContextVar[bool] = ContextVar("gateway", default=False)
 
 
@@ -93,14 +94,22 @@ class Ear:
             self.waiting += data
             self._wait()
         else:
-            self.receiver.received(data)
+            self._tell(self.receiver.received, data)
 
     def lost(self, error: Exception) -> None:
         if self.freezer.frozen:
             self.error = error
             self._wait()
         else:
-            self.receiver.lost(error)
+            self._tell(self.receiver.lost, error)
+
+    def _tell(self, callback: Callable[[_T], object], what: _T) -> None:
+        """Calls the gateway: a timer that it sets then is its own."""
+        before = _GATEWAY.set(True)
+        try:
+            callback(what)
+        finally:
+            _GATEWAY.reset(before)
 
     def _wait(self) -> None:
         if self not in self.freezer.ears:
@@ -110,6 +119,6 @@ class Ear:
         waiting, self.waiting = self.waiting, b""
         error, self.error = self.error, None
         if waiting:
-            self.receiver.received(waiting)
+            self._tell(self.receiver.received, waiting)
         if error is not None:
-            self.receiver.lost(error)
+            self._tell(self.receiver.lost, error)
