@@ -42,7 +42,7 @@ from gateway.protocols.capabilities import (
     Identifies,
     ScatteredWriter,
 )
-from gateway.protocols.driver import AnyDriver, Span, Talk
+from gateway.protocols.driver import AnyDriver, Span
 
 T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
@@ -119,7 +119,7 @@ async def _identify(job: Identify, talk: Transaction) -> Identified:
         with _refused_is_unclear():
             await driver.resync(talk, None, job.token, device.probe_spans)
     for tag in tags:
-        told[tag.name] = (str(tag.decode(await driver.read(talk, tag.span))),)
+        told[tag.name] = (str(tag.decode(await _held(device, tag.span, talk))),)
     return Identified(told)
 
 
@@ -141,10 +141,11 @@ async def _resync_before(device: Device, span: Span | None, token: int, talk: Tr
 
 
 async def _prove_read(device: Device, talk: Transaction) -> None:
-    """Waits until the own reply would have arrived too, where extra replies arrive. Raises `Busy`
-    if one did that could be it."""
-    if device.is_doubtful:
-        gap = device.settled_after
+    """Waits until the own reply would have arrived too, where extra replies arrive, or one came
+    sooner than the station can reply. Raises `Busy` if one did that could be it."""
+    too_soon = talk.traffic.doubtful
+    if device.is_doubtful or too_soon:
+        gap = device.longest_reply if too_soon else device.settled_after
         settled = await talk.settle(device.longest_reply + gap, gap)
         if talk.traffic.contradicted or not settled.quiet:
             raise Busy(UNPROVEN)
@@ -173,6 +174,7 @@ async def _write(write: Write, talk: Transaction) -> Sent:
         await _resync_before(write.device, tag.span, write.resyncs.before, talk)
     if write.part is not None and not write.masked:
         (word,) = await driver.read(talk, tag.span)
+        await _prove_read(write.device, talk)
         units = [write.part.into(word, write.units[0])]
     if write.masked and write.part is not None and isinstance(driver, ChangesBits):
         bits = write.part.into(0, write.units[0])
@@ -189,10 +191,26 @@ async def _write(write: Write, talk: Transaction) -> Sent:
         acknowledged = True
     if not acknowledged or not verify:
         return Sent(acknowledged)
+    return await _sent_and_held(write.device, tag.span, talk)
+
+
+async def _sent_and_held(device: Device, span: Span, talk: Transaction) -> Sent:
+    """Returns the result of an acknowledged write whose span is read back."""
     try:
-        return Sent(held=await driver.read(talk, tag.span))
+        return Sent(held=await _held(device, span, talk))
     except Refused as error:
         return Sent(refused_back=error)
+
+
+async def _held(device: Device, span: Span, talk: Transaction) -> Sequence[int]:
+    """Reads back what was written. Raises `Unclear` if the reply may be another one."""
+    talk.traffic.doubtful = False
+    units = await device.driver.read(talk, span)
+    try:
+        await _prove_read(device, talk)
+    except Busy as error:
+        raise Unclear(str(error)) from error
+    return units
 
 
 async def _one_by_one(write: Write, long: LongWrite, talk: Transaction) -> bool:
@@ -220,14 +238,12 @@ async def _write_run(job: WriteTogether, run: Span, talk: Transaction) -> Sent:
         await _resync_before(job.device, run, first.resyncs.before, talk)
     if needs_read(job.writes):
         held = await _read_before(driver, run, talk)
+        await _prove_read(job.device, talk)
     sending = driver.write(talk, run, together(run, job.writes, held))
     acknowledged = await _only_reply(sending, first, talk, run)
     if not acknowledged or not any(verified(write.tag) for write in job.writes):
         return Sent(acknowledged)
-    try:
-        return Sent(held=await driver.read(talk, run))
-    except Refused as error:
-        return Sent(refused_back=error)
+    return await _sent_and_held(job.device, run, talk)
 
 
 async def _read_before(driver: AnyDriver, run: Span, talk: Transaction) -> Sequence[int]:
@@ -289,26 +305,27 @@ async def _resync_after(write: Write, span: Span, token: int, talk: Transaction)
         await device.driver.read(talk, device.good_reads.last)
 
 
-async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:
+async def _read_back(job: ReadBack, talk: Transaction) -> HeldTogether:
     """Reads the run with one request. If it is refused, the tags follow one by one."""
     driver, run = job.device.driver, job.run
     if run is not None and driver.cost(run) is not None:
         with suppress(Refused):
-            whole = await driver.read(talk, run)
+            whole = await _held(job.device, run, talk)
             return HeldTogether([own_units(write, run, whole) for write in job.writes])
     held: list[Sequence[int] | Refused | None] = []
     for span in (write.tag.span for write in job.writes):
         try:
-            held.append(None if driver.cost(span) is None else await driver.read(talk, span))
+            readable = driver.cost(span) is not None
+            held.append(await _held(job.device, span, talk) if readable else None)
         except Refused as error:
             held.append(error)
     return HeldTogether(held)
 
 
-async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
+async def _confirm(job: Confirm, talk: Transaction) -> Sent:
     driver = job.device.driver
     with _refused_is_unclear():
         await driver.resync(talk, job.outstanding, job.token, job.device.probe_spans)
     if not any(verified(write.tag) for write in job.writes):
         return Sent()
-    return Sent(held=await driver.read(talk, job.run))
+    return Sent(held=await _held(job.device, job.run, talk))
