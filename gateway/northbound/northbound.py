@@ -258,7 +258,10 @@ class Northbound:
             await off_loop(self._declare_plant, declarations)
             traces = Traces(self.keys, self._plant, self._publisher.document)
             self._declared += await off_loop(traces.declare, session, traces.inbox())
-            await self._republisher.publish_all()
+            if len(self._links):  # else nothing would arrive; each link has all published
+                await self._republisher.publish_all()
+            else:
+                await self._parts.publish_all()
             self._status.publish()
             self.opened.set()
             await off_loop(self._incoming.changed)  # a reload came between

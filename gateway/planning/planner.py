@@ -21,6 +21,7 @@ from gateway.tags import Tag
 from gateway.tags.scan import Decoder
 
 Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and n
+_NewBlock = tuple[Span, float, tuple[Tag, ...], Cost]  # the arguments of a `Block`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,13 +72,23 @@ def plan(
     The blocks are in the order of areas and addresses; equal arguments give equal blocks. Raises
     `ConfigError` for a tag that does not fit one request.
     """
+    return tuple(Block(*one) for one in _planned(tags, driver, seconds, cuts))
+
+
+def requests_a_second(
+    tags: Iterable[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts = frozenset()
+) -> float:
+    """Returns the requests a second of the plan, without its blocks."""
+    return sum(1 / every for _, every, _, _ in _planned(tags, driver, seconds, cuts))
+
+
+def _planned(
+    tags: Iterable[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts
+) -> Iterator[_NewBlock]:
     model = model_of(driver)
-    blocks: list[Block] = []
     for area, some in _by_area(tags, driver):
         items = items_of(some)
-        requests = _cover(model, area, items, seconds, cuts)
-        blocks += _blocks(area, items, requests, driver)
-    return tuple(blocks)
+        yield from _blocks(area, items, _cover(model, area, items, seconds, cuts), driver)
 
 
 def shortest_round(
@@ -125,8 +136,8 @@ def _span(area: str, items: Sequence[Item], request: Request) -> Span:
 
 def _blocks(
     area: str, items: Sequence[Item], requests: Sequence[Request], driver: AnyDriver
-) -> Iterator[Block]:
-    """Yields a block for each request. A tag joins the fastest request over it: the freshest."""
+) -> Iterator[_NewBlock]:
+    """Yields the block of each request. A tag joins the fastest request over it: the freshest."""
     members: dict[Request, list[Tag]] = {request: [] for request in requests}
     waiting = deque(requests)
     over: list[Request] = []  # requests over the current item
@@ -139,7 +150,7 @@ def _blocks(
         span = _span(area, items, request)
         cost = driver.cost(span)
         if cost is not None and tags:
-            yield Block(span, request.every, tuple(tags), cost)
+            yield span, request.every, tuple(tags), cost
 
 
 def _between(end: int, start: int, fences: Sequence[int]) -> bool:

@@ -25,18 +25,26 @@ def numbers(
     """Returns the function from the units of a read to the numbers of the tags, and the functions
     from each number to its value; None: they are the values. None if the tags do not qualify."""
     form, end, orders = "", 0, {(_BIG, _BIG), (_BIG, _LITTLE), (_LITTLE, _BIG), (_LITTLE, _LITTLE)}
+    known: dict[object, tuple[str, DecodeOne]] = {}  # tags of a block are alike as a rule
+    converts: list[DecodeOne] = []
     for tag, begin in zip(tags, begins, strict=True):
-        layout = tag.layout
-        code = STRUCT.get(layout.type.kind)
-        if code is None or not _is_number(tag) or begin < end:
+        size = tag.span.size
+        alike = id(tag.layout), id(tag.shaping), id(tag.origin), tag.address.bit, size
+        if (found := known.get(alike)) is None:
+            code = STRUCT.get(tag.layout.type.kind)
+            if code is None or not _is_number(tag):
+                return None
+            convert = number_decoder(tag.layout, tag.line, tag.shaping)
+            found = known[alike] = code[1:], convert
+            orders &= _orders(tag.layout, size)
+        if begin < end:
             return None
-        form += f"{2 * (begin - end)}x{code[1:]}"
-        end = begin + tag.span.size
-        orders &= _orders(layout, tag.span.size)
+        form += f"{2 * (begin - end)}x{found[0]}"
+        end = begin + size
+        converts.append(found[1])
     if not orders:
         return None
     words, octets = min(orders)
-    converts = [number_decoder(tag.layout, tag.line, tag.shaping) for tag in tags]
     plain = all(convert is index for convert in converts)
     return _unpack(words, octets, end, form), None if plain else converts
 

@@ -271,11 +271,12 @@ def check_served_line(
 
 def check_sources(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
     """Notes sources that do not exist, or do not fit."""
+    rows = [(path, row) for path, row in _rows(lines) if row.source is not None]
+    if not rows:  # as in most files
+        return
     tags = {tag.key: tag for line in lines for device in line.devices for tag in device.tags}
-    for path, row in _rows(lines):
-        if row.source is None:
-            continue
-        source, own = tags.get(row.source), mistakes.at(*path, "source")
+    for path, row in rows:
+        source, own = tags.get(row.source or ""), mistakes.at(*path, "source")
         if source is None:
             text = f"there is no tag {row.source}: write device/tag, a tag of this file"
             own.add(text)

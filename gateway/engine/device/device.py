@@ -16,7 +16,7 @@ from gateway.engine.device.turnaround import Turnaround
 from gateway.errors import NO_TROUBLE, Diagnosis, Evidence, Garbled, LineDown, NoReply
 from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
-from gateway.planning.planner import Block, around, plan, runs_of
+from gateway.planning.planner import Block, around, plan, requests_a_second, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.capabilities import Monitor, Windowed
 from gateway.protocols.driver import PROOF, AnyDriver, Cost, Span, Timing
@@ -349,8 +349,7 @@ class Device:
 
     def _fewest_requests(self) -> float:
         """Returns the requests a second of the plan that has the fewest."""
-        found = plan(self.tags, self.driver, _alike, self.bad_addresses.cuts)
-        return sum(1 / block.every for block in found)
+        return requests_a_second(self.tags, self.driver, _alike, self.bad_addresses.cuts)
 
     @property
     def _planning_takes_long(self) -> bool:

@@ -1,6 +1,7 @@
 """The type of a tag, and the order of its words and bytes."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Annotated, Any
 
 from gateway.config.settings import parsers
@@ -63,14 +64,17 @@ def default_type(driver: Addressing, unit: Unit) -> ValueType:
             return ValueType(Kind.INT32)
 
 
+_layout = lru_cache(maxsize=1024)(Layout)  # tags that are alike have one object
+
+
 def layout_of(own: Any, settings: Any, driver: Addressing, area: Area, kind: ValueType) -> Layout:
     """Returns the layout of a checked tag."""
     if area.unit is Unit.DWORD:  # the driver puts it together, whatever its order on the wire
-        return Layout(kind)
+        return _layout(kind)
     if kind.kind in BYTES:
-        return Layout(kind, byte=own.byte or Byte.LOW)
+        return _layout(kind, byte=own.byte or Byte.LOW)
     usual = driver.traits.string_order if kind.kind is Kind.STRING else Order.HIGH_FIRST
-    return Layout(kind, settings.word_order, settings.byte_order or usual)
+    return _layout(kind, settings.word_order, settings.byte_order or usual)
 
 
 def type_misfit(kind: ValueType, area: Area, address: Address, driver: Addressing) -> str | None:
