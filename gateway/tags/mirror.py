@@ -138,8 +138,8 @@ class Mirror:
         """
         changed = []
         for sample in samples:
-            if self._publishes_all(sample.tag):
-                continue
+            if self._current.get(sample.tag) is None or self._publishes_all(sample.tag):
+                continue  # the next one is published in any case
             last = self._published.get(sample.tag)
             self._published[sample.tag] = sample
             if last is not None and last.value != sample.value:

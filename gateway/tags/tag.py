@@ -107,11 +107,13 @@ class Tag:
     write: WriteRule | None = None
     origin: Origin = READ
     features: tuple[object, ...] = ()  # the settings of other features, one of each class
+    key: str = field(init=False, repr=False)  # unique in the gateway: `device/name`
     element: "Tag | None" = field(init=False, repr=False)  # the first one of an array
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "key", f"{self.device}/{self.name}")
         object.__setattr__(self, "element", self._first() if self.layout.type.count else None)
         object.__setattr__(self, "convert", self._decoder(self.shaping))
 
@@ -182,6 +184,7 @@ class Tag:
             put(twin, value)
         object.__setattr__(twin, "device", device)
         object.__setattr__(twin, "name", name)
+        object.__setattr__(twin, "key", f"{device}/{name}")
         if self.origin.inputs:
             inputs = tuple(one.copy(device, name) for one in self.origin.inputs)
             object.__setattr__(twin, "origin", replace(self.origin, inputs=inputs))
@@ -205,11 +208,6 @@ class Tag:
         hides = self.shaping.clamp is not None
         convert = self._decoder(replace(self.shaping, clamp=None)) if hides else self.convert
         return lambda key: bounds.exclude(convert(key))
-
-    @property
-    def key(self) -> str:
-        """Unique in the gateway: `device/name`."""
-        return f"{self.device}/{self.name}"
 
     @property
     def recorded_key(self) -> str:

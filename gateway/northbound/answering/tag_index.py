@@ -26,8 +26,7 @@ class TagIndex:
             _Entry(device, zenoh.KeyExpr(f"{keys.device(device.name)}/**")) for device in devices
         ]
         self.tags: Sequence[Tag] = [tag for entry in self._entries for tag in entry.device.tags]
-        self.value_keys = {tag: keys.value(tag.key) for tag in self.tags}
-        self._by_key = {key: tag for tag, key in self.value_keys.items()}
+        self._by_key = {tag.key: tag for tag in self.tags}
         modes = {entry.device.name: entry.device.blocks for entry in self._entries}
         self.names = frozenset(modes)
         self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
@@ -40,7 +39,8 @@ class TagIndex:
         vars(self).update(vars(other))
 
     def tag_at(self, value_key: str) -> Tag | None:
-        return self._by_key.get(value_key)
+        key = self.keys.tag(value_key)
+        return None if key is None else self._by_key.get(key)
 
     def is_device(self, key: str) -> bool:
         """True for the key of one of our devices: no tag, no wildcard."""
@@ -57,7 +57,7 @@ class TagIndex:
     def tags_at(self, expression: str) -> list[Tag]:
         """Returns the tags whose value keys intersect `expression`."""
         if "*" not in expression:
-            tag = self._by_key.get(expression)
+            tag = self.tag_at(expression)
             return [] if tag is None else [tag]
         selector = zenoh.KeyExpr(expression)
         found: list[Tag] = []
@@ -65,8 +65,8 @@ class TagIndex:
             if selector.includes(entry.area):
                 found.extend(entry.device.tags)
             elif selector.intersects(entry.area):
-                keys = ((tag, self.value_keys[tag]) for tag in entry.device.tags)
-                found.extend(tag for tag, key in keys if selector.intersects(key))
+                tags, value = entry.device.tags, self.keys.value
+                found.extend(tag for tag in tags if selector.intersects(value(tag.key)))
         return found
 
     def devices_at(self, expression: str) -> list[Device]:

@@ -29,7 +29,7 @@ from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.publishing import encoding
 from gateway.northbound.publishing.handover import Handover
 from gateway.northbound.publishing.slow_puts import SlowPuts
-from gateway.tags import Sample, Tag
+from gateway.tags import Sample
 from gateway.tags.scan import Samples
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -85,7 +85,7 @@ class Publisher:
 
     def __init__(self, losses: SlowPuts, index: TagIndex) -> None:
         self.ended = asyncio.Event()  # the thread has ended, expected or not
-        self.superseded = Counter[str]()  # values that a newer one replaced here, by key
+        self.superseded = Counter[str]()  # values that a newer one replaced here, by tag
         self._dropped = 0  # events and documents: the queue was full, or no session was open yet
         self._index = index
         self._losses = losses
@@ -112,7 +112,8 @@ class Publisher:
 
     def most_superseded(self) -> dict[str, int]:
         """Returns the keys of the values that newer ones replaced most often, with how often."""
-        return dict(self.superseded.most_common(MOST_SHOWN))
+        most = self.superseded.most_common(MOST_SHOWN)
+        return {self._index.keys.value(tag): count for tag, count in most}
 
     @property
     def session(self) -> zenoh.Session | None:
@@ -140,25 +141,22 @@ class Publisher:
             return
         data: Sequence[_Data]
         if isinstance(samples, Samples):
-            keys, data = self._keys_of(samples.tags), encoding.scan(samples)
+            tags, data = [tag.key for tag in samples.tags], encoding.scan(samples)
         else:
-            last = {sample.tag: sample for sample in samples}
-            keys, data = self._keys_of([*last]), [*last.values()]
+            last = {sample.tag.key: sample for sample in samples}
+            tags, data = [*last], [*last.values()]
             if len(last) < len(samples):
-                gone = [sample.tag for sample in samples if last[sample.tag] is not sample]
-                self.superseded.update(self._keys_of(gone))
+                gone = [sample.tag.key for sample in samples if last[sample.tag.key] is not sample]
+                self.superseded.update(gone)
+        keys = map(self._index.keys.value, tags)
         stamp, waiting = self._session.new_timestamp, self._waiting
         with self._handover.lock:
-            if not waiting.keys().isdisjoint(keys):
+            if not waiting.keys().isdisjoint(tags):
                 # Removed first, so that the entry moves to the end: stamps leave in order.
-                self.superseded.update([key for key in keys if waiting.pop(key, None)])
-            puts = zip([stamp() for _ in keys], keys, data, strict=True)
-            waiting.update(zip(keys, puts, strict=True))
+                self.superseded.update([tag for tag in tags if waiting.pop(tag, None)])
+            puts = zip([stamp() for _ in tags], keys, data, strict=True)
+            waiting.update(zip(tags, puts, strict=True))
         self._handover.soon()
-
-    def _keys_of(self, tags: Sequence[Tag]) -> list[str]:
-        known = self._index.value_keys  # a disabled tag may have gone already
-        return [known.get(tag) or self._index.keys.value(tag.key) for tag in tags]
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:
         """Queues the changed samples of one scan of a device, merged with a waiting block.
@@ -293,7 +291,8 @@ class Publisher:
             return bool(waiting)
 
     def _values_of(self, key: str, data: _Data) -> Sequence[str]:
-        """Returns the keys of the values in a put."""
+        """Returns the tags, by key, whose values are in a put."""
         if isinstance(data, dict):
-            return self._keys_of([sample.tag for sample in data.values()])
-        return [key]
+            return [sample.tag.key for sample in data.values()]
+        tag = self._index.tag_at(key)
+        return [] if tag is None else [tag.key]
