@@ -130,6 +130,12 @@ async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> N
             await received.until(lambda of: len(of.latest()) == 4)
 
 
+async def test_no_value_is_put_before_there_is_a_link() -> None:
+    async with serving(of_mixer(1000), ZenohConfig(listen=(free_endpoint(),))) as northbound:
+        pass  # its end puts all that waits
+    assert northbound.counters()["published"] < 100  # documents
+
+
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     settings = {"links": LinkMonitor(), "losses": SlowPuts(0.05), "refresh": 1e6, **how}
