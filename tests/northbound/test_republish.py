@@ -153,7 +153,7 @@ def of_mixer(count: int) -> PlainPlant:
 async def test_values_that_a_full_link_may_have_dropped_are_published_again() -> None:
     plant, published, losses = of_mixer(1000), list[Sample](), SlowPuts(0.05)
     current = list(plant.samples.values())
-    losses.sent([sample.tag.key for sample in current[:300]], 0.05, now())
+    losses.sent([f"plant/{sample.tag.key}" for sample in current[:300]], 0.05, now())
     task = asyncio.create_task(republisher(plant, published, losses=losses).run())
     await asyncio.sleep(1.6)
     assert published == current[:300]
@@ -167,10 +167,10 @@ async def test_a_round_ends_when_the_link_is_full_again() -> None:
 
     def publish(samples: Sequence[Sample]) -> None:
         published.extend(samples)
-        losses.sent([sample.tag.key for sample in samples], 0.05, now())
+        losses.sent([f"plant/{sample.tag.key}" for sample in samples], 0.05, now())
 
     index = TagIndex(Keys("plant", "demo"), plant.devices())
-    losses.sent([sample.tag.key for sample in plant.samples.values()], 0.05, now())
+    losses.sent([f"plant/{sample.tag.key}" for sample in plant.samples.values()], 0.05, now())
     again = Republisher(publish, plant, index, LinkMonitor(), losses, 1e6, nothing)
     task = asyncio.create_task(again.run())
     await asyncio.sleep(1.4)

@@ -291,8 +291,7 @@ class Publisher:
             return bool(waiting)
 
     def _values_of(self, key: str, data: _Data) -> Sequence[str]:
-        """Returns the tags, by key, whose values are in a put."""
+        """Returns the keys of the values in a put."""
         if isinstance(data, dict):
-            return [sample.tag.key for sample in data.values()]
-        tag = self._index.tag_at(key)
-        return [] if tag is None else [tag.key]
+            return [self._index.keys.value(sample.tag.key) for sample in data.values()]
+        return [key]

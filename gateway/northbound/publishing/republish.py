@@ -102,7 +102,7 @@ class Republisher:
             for start in range(0, len(keys), _FEW):
                 if self._losses.congested > congested:
                     break  # the link is full again: the rest waits for the next round
-                found = map(self._plant.tag, keys[start : start + _FEW])
+                found = map(self._index.tag_at, keys[start : start + _FEW])
                 self._publish_again([tag for tag in found if tag is not None])
                 await asyncio.sleep(_FEW_EVERY)
 

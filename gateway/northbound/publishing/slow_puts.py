@@ -25,11 +25,11 @@ class SlowPuts:
         self.until = _NEVER  # what is put before is suspect
         self._slow_at = _NEVER
         self._round = 0
-        self._suspects: dict[str, None] = {}  # keys of tags, in the order of their last put
+        self._suspects: dict[str, None] = {}  # keys of values, in the order of their last put
         self._lock = threading.Lock()
 
     def sent(self, keys: Iterable[str], took: float, now: float) -> None:
-        """Notes one put: the keys of its tags, and how many seconds it took."""
+        """Notes one put: the keys of its values, and how many seconds it took."""
         if took < self.limit and now > self.until:
             return
         with self._lock:
