@@ -144,7 +144,7 @@ class Engine:
             if good:  # units are the only good result of a poll
                 units = cast("Sequence[int]", result)
                 shapes, doubtful = job.device.shapes, traffic.extra > 0 or traffic.doubtful
-                if shapes is not None and (doubtful or shapes.quiet == WARY):
+                if shapes is not None and (doubtful or in_flight.held or shapes.quiet == WARY):
                     self._next_job.proofs.hold(HeldRead(entry, units, now, time), traffic)
                 else:
                     self._polls.read(entry, units, now, time)

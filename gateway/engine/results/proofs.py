@@ -107,13 +107,14 @@ class Proofs:
 
 
 def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
-    """Returns True if the reply may be an earlier one, and no own reply may follow it.
+    """Returns True if the reply may be another one, and no own reply may follow it.
 
-    An earlier reply with this shape may arrive once more. The station had no reply to this read
-    last time, or it replies much sooner otherwise.
+    The station had no reply to this read last time. Or it replies much sooner otherwise, and an
+    earlier reply with this shape may arrive once more.
     """
     shapes, usual = poll.device.shapes, poll.device.usual_turnaround
-    if shapes is None or not shapes.collided:
+    if poll.missed:
+        return True
+    if shapes is None or usual is None or not shapes.collided:
         return False
-    late = usual is not None and traffic.turnaround > max(LATE, SLOWER * usual)
-    return late or poll.missed > 0
+    return traffic.turnaround > max(LATE, SLOWER * usual)
