@@ -48,7 +48,8 @@ class LongerReads:
         # By block: when a longer span was refused last, and all that were
         self._lacking: dict[Span, tuple[float, list[Span]]] = {}
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
-        self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
+        # By block: longer reads without a reply, and the shortest of them
+        self.failed: dict[Span, tuple[int, Span]] = {}
         self.alone: set[Span] = set()  # to be read without other addresses once
         self.forget_at = math.inf  # when `forget` must be called
 
@@ -100,19 +101,26 @@ class LongerReads:
             del self._lacking[span]
             self.by_span.pop(span, None)
 
-    def unanswered(self, span: Span, now: float) -> None:
+    def unanswered(self, span: Span, longer: Span, now: float) -> None:
         """Counts a read of a longer span without a reply: some stations refuse by silence.
 
-        The next read is that of the span itself, and so are all later ones after `MOST_FAILED`.
+        The next read is that of the span itself. After `MOST_FAILED` the shortest one that failed
+        is refused.
         """
         self.alone.add(span)
-        self.failed[span] = self.failed.get(span, 0) + 1
-        if self.failed[span] >= MOST_FAILED:
-            self.refused(span, span, now)
+        count, shortest = self.failed.pop(span, (0, longer))
+        if longer.size < shortest.size:
+            shortest = longer
+        if count + 1 < MOST_FAILED:
+            self.failed[span] = count + 1, shortest
+        else:
+            self.refused(span, shortest, now)
 
-    def answered(self, span: Span) -> None:
-        """Notes a reply to a read of a longer span."""
-        self.failed.pop(span, None)
+    def answered(self, span: Span, longer: Span) -> None:
+        """Notes a reply to a read of a longer span. It says nothing of one that is longer still."""
+        known = self.failed.get(span)
+        if known is not None and within(known[1], longer):
+            del self.failed[span]
 
     def restart(self, now: float) -> None:
         """Starts again after the device came online: it may have other addresses now."""

@@ -57,7 +57,7 @@ class PollRules:
             self._results.answered(device, now, time)
         shapes = device.shapes
         if shapes is not None and shapes.longer.failed and poll.job.span is not block.span:
-            shapes.longer.answered(block.span)
+            shapes.longer.answered(block.span, poll.job.span)
         if not block.listed:
             device.good_reads.note(block.span)
         samples = self._schedule.read(poll, units, now, time)
@@ -226,7 +226,7 @@ class PollRules:
                 bad.went_silent(poll.block)
             return
         if poll.job.span is not poll.block.span and device.shapes is not None:
-            device.shapes.longer.unanswered(poll.block.span, now)
+            device.shapes.longer.unanswered(poll.block.span, poll.job.span, now)
             self._schedule.again(poll, counted=False)
             return
         suspect, half = bad.is_suspect(poll.block), bad.is_half(poll.block)
