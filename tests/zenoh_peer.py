@@ -104,7 +104,7 @@ class Received(NamedTuple):
 
     @property
     def json(self) -> Any:
-        return json.loads(self.payload)
+        return _parsed(self.payload)
 
 
 class Reply(NamedTuple):
@@ -118,7 +118,7 @@ class Reply(NamedTuple):
 
     @property
     def json(self) -> Any:
-        return json.loads(self.payload)
+        return _parsed(self.payload)
 
 
 class Subscription:
@@ -366,6 +366,13 @@ class ZenohPeer:
         for answer in self._pending.values():
             if not answer.done():
                 answer.set_exception(ConnectionError("the Zenoh peer has ended"))
+
+
+def _parsed(payload: bytes) -> Any:
+    try:
+        return json.loads(payload)
+    except ValueError as error:
+        raise AssertionError(f"this is no JSON: {payload[:1000]!r}") from error
 
 
 def _text(payload: bytes | None) -> str | None:
