@@ -270,7 +270,7 @@ def _is_due(last: Sample | None, sample: Sample) -> bool:
     old, new, band = last.value, sample.value, rule.deadband
     if band is None or old is None or new is None:
         return old != new
-    if tag.element is None:
+    if not tag.layout.type.count:
         return _moved(band, old, new)
     return any(_moved(band, *pair) for pair in zip(old, new, strict=True))  # type: ignore[arg-type]
 

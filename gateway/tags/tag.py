@@ -108,22 +108,24 @@ class Tag:
     origin: Origin = READ
     features: tuple[object, ...] = ()  # the settings of other features, one of each class
     key: str = field(init=False, repr=False)  # unique in the gateway: `device/name`
-    element: "Tag | None" = field(init=False, repr=False)  # the first one of an array
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "key", f"{self.device}/{self.name}")
-        object.__setattr__(self, "element", self._first() if self.layout.type.count else None)
         object.__setattr__(self, "convert", self._decoder(self.shaping))
 
-    def _first(self) -> "Tag":
-        size = self.span.size // self.layout.type.count
-        return replace(self, layout=self.layout.element, span=self.span._replace(size=size))
+    @property
+    def element(self) -> "Tag | None":
+        """The first element of an array; None: it is no array. Each call makes another object."""
+        if not (count := self.layout.type.count):
+            return None
+        span = self.span._replace(size=self.span.size // count)
+        return replace(self, layout=self.layout.element, span=span)
 
     def _decoder(self, shaping: Shaping) -> Decode:
-        if self.element is not None:
-            return array_decoder(self.element._decoder(shaping), self.element.span.size)
+        if (element := self.element) is not None:
+            return array_decoder(element._decoder(shaping), element.span.size)
         origin = self.origin
         if origin.formula is not None:
             return with_shaping(origin.formula.value, shaping)
@@ -162,7 +164,7 @@ class Tag:
     @property
     def is_scalar(self) -> bool:
         """True if a good value is one number or bit."""
-        return self.element is None and not self.layout.type.is_text
+        return not self.layout.type.count and not self.layout.type.is_text
 
     @property
     def polled(self) -> bool:
@@ -240,8 +242,8 @@ class Tag:
 
         A tag that is a part of a word gives that part alone: [0] or [1] for a bit.
         """
-        if self.element is not None:
-            return self._elements(self.element, value)
+        if (element := self.element) is not None:
+            return self._elements(element, value)
         if isinstance(value, tuple):
             raise BadValue(f"{self.name} has one value: send no list")
         return self._one(value)

@@ -155,11 +155,14 @@ async def _line_lost(line: Plant) -> None:
 
 async def _other_computer(line: Plant) -> None:
     """Another computer on the wire registers a list of the same length; the line receives it."""
-    # Private: nothing outside shows that no transaction is open. A full line always has one.
+    # Private: nothing outside shows that no transaction is open. A full line always has one: then
+    # it says nothing. Between two requests of a transaction the line does not hear it.
     for _ in range(1000):
         if line.line._transaction is None:
             break
         await asyncio.sleep(0.001)
+    else:
+        return
     _other_list(line)
     line.bench.received(b"\x0505FFWM0")
 

@@ -118,7 +118,7 @@ class Recent:
                     continue
                 if len(run.samples) >= run.longest:
                     run = self._begin()
-                if tag.element is not None:
+                if tag.layout.type.count:
                     run.longest -= tag.layout.type.count // ELEMENTS
                 run.samples.append(sample)
                 run.by_tag.setdefault(tag.recorded_key, []).append(sample)
