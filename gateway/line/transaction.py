@@ -16,8 +16,6 @@ from gateway.protocols.driver import Codec, EndedByGap
 
 T = TypeVar("T")
 MOST_REMEMBERED = 4096  # bytes of one reply
-GAP = 0.02  # seconds without a byte, at least, that end a spoiled reply,
-SLOWER = 3.0  # and so many times the usual turnaround
 
 
 @dataclass(slots=True, eq=False)
@@ -225,10 +223,7 @@ class Transaction:
         if request.future.done() or device.shapes is None or self._stray is not None:
             return None
         echo = 0 if self._channel.echo.strip or not self.may_echo else len(request.data)
-        usual = device.usual_turnaround
-        if usual is None or len(self._heard) < request.reply + echo:
-            return None
-        return max(GAP, SLOWER * usual)
+        return None if len(self._heard) < request.reply + echo else device.late_from
 
     def _spoiled(self) -> None:
         for request in self._open:

@@ -6,9 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import pytest
+
 from gateway.engine.device.device import Device
 from gateway.planning.wire_timing import WireTiming
+from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu
+from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from gateway.tags import Tag
 from gateway.transport import Receiver
@@ -16,6 +21,14 @@ from tests.sim.bench import WIRE, Bench
 from tests.sim.plant import Plant, made_device
 from tests.sim.virtual import now
 
+# Those whose replies have no number
+DRIVERS = [
+    ModbusRtu(station=1),
+    ModbusAscii(station=1),
+    Vigor(station=1),
+    ComputerLink(station=1, monitor=False),
+]
+by_protocol = pytest.mark.parametrize("driver", DRIVERS, ids=lambda driver: driver.protocol)
 GUARD = 0.5
 TURNAROUND = 0.005  # seconds of its PLC
 

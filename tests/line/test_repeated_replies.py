@@ -18,18 +18,10 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from gateway.tags import Quality, Tag, WriteRule
-from tests.line.device_server import GUARD, TURNAROUND, DeviceServer, behind
+from tests.line.device_server import GUARD, TURNAROUND, DeviceServer, behind, by_protocol
 from tests.sim.bench import WIRE
 from tests.sim.plant import Plant, made_device, make_tag, running
 from tests.sim.virtual import now, on_virtual_time
-
-DRIVERS = [
-    ModbusRtu(station=1),
-    ModbusAscii(station=1),
-    Vigor(station=1),
-    ComputerLink(station=1, monitor=False),
-]
-by_protocol = pytest.mark.parametrize("driver", DRIVERS, ids=lambda driver: driver.protocol)
 
 
 @dataclass

@@ -9,23 +9,13 @@ import pytest
 
 from gateway.engine.device.device import Device
 from gateway.errors import Busy, Unclear
-from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver, Span
-from gateway.protocols.modbus import ModbusAscii, ModbusRtu
-from gateway.protocols.vigor import Vigor
 from gateway.tags import Tag, WriteRule
-from tests.line.device_server import TURNAROUND, DeviceServer, behind
+from tests.line.device_server import DRIVERS, TURNAROUND, DeviceServer, behind, by_protocol
 from tests.sim.bench import WIRE
 from tests.sim.plant import Plant, make_tag, running
 from tests.sim.virtual import on_virtual_time
 
-DRIVERS = [
-    ModbusRtu(station=1),
-    ModbusAscii(station=1),
-    Vigor(station=1),
-    ComputerLink(station=1, monitor=False),
-]
-by_protocol = pytest.mark.parametrize("driver", DRIVERS, ids=lambda driver: driver.protocol)
 PLANNED, NEW, OTHER = 100, 200, 300  # addresses
 
 

@@ -33,6 +33,8 @@ ANSWERS_TWICE = (
     "device server repeats replies"
 )
 ECHO_PROVEN_FOR = 2.0  # seconds after which an adapter may echo that did not before
+# A reply is late from so many seconds on, at least, and from so many times the usual turnaround
+LATE, SLOWER = 0.02, 3.0
 QUIET_MARGIN = 0.05  # seconds that a station may take longer than usual
 PROOF_COST = Cost(20, 30)  # characters of a resync, about
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
@@ -125,6 +127,12 @@ class Device:
         """Seconds of the station for a reply, measured or from the file; None: not known yet."""
         measured, given = self.record.replies.turnaround, self.turnaround.configured
         return given if measured is None else max(measured, given or 0.0)
+
+    @property
+    def late_from(self) -> float | None:
+        """Seconds of the station after which a reply is later than usual; None: not known yet."""
+        usual = self.usual_turnaround
+        return None if usual is None else max(LATE, SLOWER * usual)
 
     def may_be_echo(self, turnaround: float, unproven: float) -> bool:
         """Returns True if a reply that equals its request may be its echo, although the adapter

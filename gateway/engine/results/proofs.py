@@ -14,8 +14,6 @@ from gateway.errors import Refused, Unsteady
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
 
 LONGEST = 0.5  # seconds: then reads get their proof
-# A reply is late from this turnaround on, in seconds, and from so many times the usual one.
-LATE, SLOWER = 0.02, 3.0
 
 
 class Proofs:
@@ -112,9 +110,8 @@ def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
     The station had no reply to this read last time. Or it replies much sooner otherwise, and an
     earlier reply with this shape may arrive once more.
     """
-    shapes, usual = poll.device.shapes, poll.device.usual_turnaround
     if poll.missed:
         return True
-    if shapes is None or usual is None or not shapes.collided:
-        return False
-    return traffic.turnaround > max(LATE, SLOWER * usual)
+    shapes, late = poll.device.shapes, poll.device.late_from
+    collided = shapes is not None and shapes.collided
+    return collided and late is not None and traffic.turnaround > late
