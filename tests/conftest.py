@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import gc
 import os
 import shutil
 import sys
@@ -12,12 +13,20 @@ import pytest
 import structlog
 from hypothesis import settings
 
+from tests.e2e import processes
 from tests.e2e.processes import Done
 from tests.sim.virtual import run_virtual as run_virtual_coroutine
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+processes.forks = True
 Command = Callable[..., Done]
+
+
+def pytest_collection_finish() -> None:
+    """Keeps the collected tests, half a million objects, out of each collection of garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -1,17 +1,14 @@
 """A gateway is held (SIGSTOP) and wakes: what it was asked to write before is not written."""
 
 import asyncio
-import os
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 from gateway.line.arrival import HELD
 from gateway.northbound.group.election import LONGEST_PAUSE
 from tests.attacks.tcp_peer import peer, tcp_reply
-from tests.e2e.processes import Program, free_port, started, station, vigor_line, write_config
+from tests.e2e.processes import Program, free_port, held, started, station, vigor_line, write_config
 from tests.zenoh_peer import POLL, TIMEOUT, ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
@@ -23,16 +20,6 @@ election.SETTLE_TIME, election.CLAIM_TIME = 0.3, 0.8
 from gateway.cli.main import main
 main()
 """
-
-
-@contextmanager
-def held(program: Program) -> Iterator[None]:
-    """Holds the process, as a hypervisor or a debugger does."""
-    os.kill(program.pid, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(program.pid, signal.SIGCONT)
 
 
 async def until_taken(client: ZenohPeer, payload: bytes) -> None:
@@ -51,7 +38,7 @@ async def test_a_write_that_arrived_while_the_gateway_was_held_is_refused(tmp_pa
         await asyncio.to_thread(gateway.says, "device online")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             assert (await client.get(RECIPE, b"50"))[0].ok
-            with held(gateway):
+            with held(gateway.pid):
                 asked = asyncio.create_task(client.get(RECIPE, b"78"))
                 await client.put(RECIPE, b"79")
                 await asyncio.sleep(HOLD)  # the attack itself
@@ -82,7 +69,7 @@ async def test_writes_that_waited_for_the_wire_when_the_gateway_was_held_are_ref
                 await client.put(f"plant/mixer/{name}/@set", b"7")
             await told.until(lambda h: bool(h.samples))
             before = len(told.samples)
-            with held(gateway):
+            with held(gateway.pid):
                 await asyncio.sleep(HOLD)
             await told.until(lambda h: len(h.samples) == len(tags))
         values = [plc.tell(f"get 1 D {500 + 40 * n}") for n in range(4)]
@@ -144,7 +131,7 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
                 for value in range(70, 78):
                     await client.put(RECIPE, b"%d" % value)
                 await plc.written.wait()
-                with held(a):
+                with held(a.pid):
                     held_long_enough = asyncio.create_task(asyncio.sleep(LONGEST_PAUSE + 0.3))
                     plc.acknowledges.set()
                     await asyncio.to_thread(b.says, "device online")

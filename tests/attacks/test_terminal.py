@@ -1,8 +1,11 @@
 """Output that cannot be written, and texts that would control the terminal or forge log lines."""
 
+import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -20,13 +23,16 @@ def config(folder: Path, endpoint: str) -> Path:
     return write_config(folder / "c.yaml", endpoint, {"Öfen": vigor_line("simulator", tags)})
 
 
-def printed_to(file: Path, *arguments: object) -> "subprocess.CompletedProcess[str]":
+def printed_to(
+    file: Path, *arguments: object, env: Mapping[str, str] = MappingProxyType({})
+) -> "subprocess.CompletedProcess[str]":
     with file.open("w") as out:
         return subprocess.run(
             [sys.executable, "-m", "gateway", *map(str, arguments)],
             cwd=ROOT,
             stdout=out,
             stderr=subprocess.PIPE,
+            env=os.environ | env,
             text=True,
             timeout=PATIENCE,
             check=False,
@@ -44,9 +50,10 @@ def test_a_full_disk_is_one_line_and_exit_code_1(command: str, tmp_path: Path) -
 @pytest.mark.parametrize("command", [["check"], ["read", "--direct"]])
 def test_a_locale_with_ascii_only_prints_names_escaped(command: list[str], tmp_path: Path) -> None:
     name, *options = command
-    done = plc_gateway(name, config(tmp_path, free_endpoint()), *options, env=ASCII)
-    assert done.code == 0, done.err
-    assert "\\x" in done.out
+    out = tmp_path / "out.txt"
+    done = printed_to(out, name, config(tmp_path, free_endpoint()), *options, env=ASCII)
+    assert done.returncode == 0, done.stderr
+    assert "\\x" in out.read_text()
 
 
 async def test_texts_of_the_network_control_neither_log_nor_terminal(tmp_path: Path) -> None:

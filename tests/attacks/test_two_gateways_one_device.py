@@ -13,6 +13,7 @@ from tests.e2e.processes import (
     Program,
     free_port,
     gateway,
+    held,
     plc_gateway,
     station,
     until,
@@ -209,10 +210,9 @@ async def test_a_gateway_that_was_frozen_keeps_its_device_when_it_wakes(tmp_path
     async with plant(tmp_path) as p:
         a = p.run(p.file("left", {"mixer": 1}))
         await p.until_alive("left/alive/mixer")
-        os.kill(a.pid, signal.SIGSTOP)
-        b = p.run(p.file("right", {"mixer": 1}))
-        await asyncio.to_thread(b.says, "device online")
-        os.kill(a.pid, signal.SIGCONT)
+        with held(a.pid):
+            b = p.run(p.file("right", {"mixer": 1}))
+            await asyncio.to_thread(b.says, "device online")
         assert await asyncio.to_thread(b.ended) == 1
         assert b.has_said("gateway left serves every device of this file already")
         await p.until_alive("left/alive/mixer")

@@ -8,15 +8,14 @@ that a bridge stands still. When all runs again, every client has the present va
 
 import argparse
 import logging
-import os
 import random
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
@@ -25,7 +24,7 @@ from tests.bridges.opcua_clients import folder as opcua_folder
 from tests.bridges.played import PlayedGateway
 from tests.bridges.sparkplug_host import SparkplugHost
 from tests.conftest import needs
-from tests.e2e.processes import Program, free_port, listens, slowed, until
+from tests.e2e.processes import Program, free_port, held, listens, slowed, until
 from tests.zenoh_peer import free_endpoint
 
 PEERS = {"mqtt": "broker", "sparkplug": "broker", "influx": "server", "opcua": "scada"}
@@ -244,7 +243,7 @@ class Campaign:
             self.start(name)
 
     def _held(self, name: str) -> None:
-        with stopped(self._programs[name]):
+        with held(self._programs[name].pid):
             self._charts_are_old = name == "influx"
             self.run_for(self._random.choice((2, 8, 40)))
 
@@ -286,15 +285,6 @@ class Campaign:
         self._influx.ill = self._charts_are_old = True
         self._pause()
         self._influx.ill = False
-
-
-@contextmanager
-def stopped(program: Program) -> Iterator[None]:
-    os.kill(program.pid, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(program.pid, signal.SIGCONT)
 
 
 def main() -> None:

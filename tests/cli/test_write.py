@@ -1,7 +1,5 @@
 """The `write` command through the running gateway."""
 
-import os
-import signal
 from pathlib import Path
 
 import pytest
@@ -12,7 +10,7 @@ from gateway.config import load
 from gateway.errors import GatewayError
 from tests.cli.conftest import TAGS, documents
 from tests.conftest import Command
-from tests.e2e.processes import started, until, until_exit, vigor_line, write_config
+from tests.e2e.processes import held, started, until, until_exit, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 
@@ -87,11 +85,12 @@ def test_a_gateway_that_hangs_does_not_get_the_write(command: Command, tmp_path:
     with started(path) as program:
         program.says("device online")
         assert command("write", path, "mixer/trim", "1").code == 0
-        with connected(load(path), print) as client:
-            os.kill(program.pid, signal.SIGSTOP)
-            with pytest.raises(GatewayError, match="nothing was sent"):
-                client.requests.write("mixer/trim", 2)
-        os.kill(program.pid, signal.SIGCONT)
+        with (
+            connected(load(path), print) as client,
+            held(program.pid),
+            pytest.raises(GatewayError, match="nothing was sent"),
+        ):
+            client.requests.write("mixer/trim", 2)
         read = until_exit(0, command, "read", path, "mixer/trim", "--json", "--max-age", "0s")
         assert read.json["value"] == 1
 

@@ -7,15 +7,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple, Self
 
+from tests.e2e.forking import ENVIRONMENT, MODULES, Forked
 from tests.zenoh_peer import free_port as free_port
 
 PATIENCE = 300.0  # seconds; never waited for when all is well
 ROOT = Path(__file__).parents[2]
-_ENVIRONMENT = {**os.environ, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "120"}
+GATEWAY = sys.executable, "-m", "gateway"
+forks = False  # not where what programs take is measured: benchmarks
 
 # Shells start what runs in the background deaf to Ctrl-C, and children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -43,18 +47,20 @@ class Done(NamedTuple):
 
 def plc_gateway(*arguments: object, **how: Any) -> Done:
     """Runs a command to its end. `cwd`; `env`: variables besides those of this process."""
-    done = subprocess.run(
-        [sys.executable, "-m", "gateway", *map(str, arguments)],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        cwd=how.pop("cwd", ROOT),
-        env=_ENVIRONMENT | how.pop("env", {}),
-        check=False,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return Done(done.returncode, done.stdout, done.stderr)
+    cwd, env = how.pop("cwd", ROOT), ENVIRONMENT | how.pop("env", {})
+    with TemporaryFile("w+") as out, TemporaryFile("w+") as err, Path(os.devnull).open() as nothing:
+        ends = [one.fileno() for one in (nothing, out, err)]
+        process = _begun([*GATEWAY, *map(str, arguments)], cwd, env, ends)
+        try:
+            code = process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+        for one in (out, err):
+            one.seek(0)
+        done = Done(code, out.read(), err.read())
+    assert "Traceback" not in done.err, done.err
+    return done
 
 
 def until_exit(code: int, run: Callable[..., Done], *arguments: object) -> Done:
@@ -78,19 +84,18 @@ class Program:
         self.errors: list[str] = []
         self._name = " ".join(map(str, command))[-100:]
         self._news = threading.Condition()
-        self._process = subprocess.Popen(
-            [str(part) for part in command],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT if merged else subprocess.PIPE,
-            text=True,
-            bufsize=1,
-            cwd=ROOT,
-            env=_ENVIRONMENT,
-        )
-        self._readers = [threading.Thread(target=self._read, args=("stdout", self.lines))]
+        (its_input, writes), (reads, its_output) = os.pipe(), os.pipe()
+        streams = [(self.lines, reads)]
+        its_errors = its_output
         if not merged:
-            self._readers.append(threading.Thread(target=self._read, args=("stderr", self.errors)))
+            reads, its_errors = os.pipe()
+            streams.append((self.errors, reads))
+        ends = its_input, its_output, its_errors
+        self._process = _begun(list(map(str, command)), ROOT, ENVIRONMENT, ends)
+        for end in set(ends):
+            os.close(end)
+        self._input = os.fdopen(writes, "w", buffering=1)
+        self._readers = [threading.Thread(target=self._read, args=one) for one in streams]
         for reader in self._readers:
             reader.start()
 
@@ -135,9 +140,7 @@ class Program:
     def tell(self, command: str) -> str:
         """Writes a line to its standard input. Returns the text that it prints after `ok`."""
         first = len(self.lines)
-        assert self._process.stdin is not None
-        self._process.stdin.write(command + "\n")
-        self._process.stdin.flush()
+        self._input.write(command + "\n")
         return self._wait(("ok",), first).removeprefix("ok").strip()
 
     def end(self, by: signal.Signals = signal.SIGTERM, within: float = PATIENCE) -> int:
@@ -155,18 +158,27 @@ class Program:
         self._process.wait(PATIENCE)
         for reader in self._readers:
             reader.join(PATIENCE)
-        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
-            if stream is not None and not stream.closed:
-                stream.close()
+        with suppress(BrokenPipeError):
+            self._input.close()
 
-    def _read(self, name: str, lines: list[str]) -> None:
-        stream = getattr(self._process, name)
-        for line in stream:
-            with self._news:
-                lines.append(line.rstrip("\n"))
-                self._news.notify_all()
+    def _read(self, lines: list[str], reads: int) -> None:
+        with os.fdopen(reads) as stream:
+            for line in stream:
+                with self._news:
+                    lines.append(line.rstrip("\n"))
+                    self._news.notify_all()
         with self._news:
             self._news.notify_all()
+
+
+def _begun(
+    words: list[str], cwd: Path, env: dict[str, str], ends: Sequence[int]
+) -> subprocess.Popen[bytes] | Forked:
+    """`ends`: descriptors of its standard input, output and errors."""
+    if forks and words[:2] == [sys.executable, "-m"] and words[2] in MODULES:
+        return Forked(words[2:], cwd, env, ends)
+    stdin, stdout, stderr = ends
+    return subprocess.Popen(words, stdin=stdin, stdout=stdout, stderr=stderr, cwd=cwd, env=env)
 
 
 def gateway(*arguments: object, merged: bool = True, variables: Sequence[str] = ()) -> Program:
@@ -175,7 +187,7 @@ def gateway(*arguments: object, merged: bool = True, variables: Sequence[str] = 
     `variables`: of its environment, besides those of this process, as `NAME=value`.
     """
     by = ("env", *variables) if variables else ()
-    return Program(*by, sys.executable, "-m", "gateway", *arguments, merged=merged)
+    return Program(*by, *GATEWAY, *arguments, merged=merged)
 
 
 def started(config: Path, *options: str) -> Program:
@@ -219,6 +231,22 @@ def device_server(ser2net: str, folder: Path, tty: Path, number: int) -> Program
     program = Program(ser2net, "-n", "-u", "-c", config, "-P", folder / "ser2net.pid")
     until(lambda: listens(number), "ser2net listens")  # it does not say so itself
     return program
+
+
+@contextmanager
+def held(pid: int) -> Iterator[None]:
+    """Holds a process, as a hypervisor or a debugger does: all its threads stand still."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        until(lambda: _states(pid) == {"T"}, "every thread stands still")
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def _states(pid: int) -> set[str]:
+    threads = Path(f"/proc/{pid}/task").glob("*/stat")
+    return {one.read_text().rpartition(")")[2].split()[0] for one in threads}
 
 
 def listens(number: int) -> bool:

@@ -180,7 +180,7 @@ def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
             [lock] = tmp_path.glob("gateway-*.lock")
             beside.add(lock)
             assert set(tmp_path.rglob("*")) - beside == files
-        until(lambda: not _holders(tty), "no process holds the port")
+        until(lambda: not _holders(tty, plc.pid), "no process holds the port")
         assert len(list(Path(f"/proc/{plc.pid}/fd").iterdir())) == kept_open
 
 
@@ -196,18 +196,16 @@ def _children(pid: int) -> list[int]:
     return found
 
 
-def _holders(tty: str) -> list[str]:
-    """Returns the gateways that have the port open."""
+def _holders(tty: str, plc: int) -> list[str]:
+    """Returns the processes besides the PLC that have the port open."""
     real, found = os.path.realpath(tty), []
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
+    for process in Path("/proc").glob("[0-9]*"):
         try:
-            if b"gateway\0run" not in command.read_bytes():
-                continue
-            opened = [os.path.realpath(fd) for fd in (command.parent / "fd").iterdir()]
+            opened = [os.path.realpath(fd) for fd in (process / "fd").iterdir()]
         except (FileNotFoundError, ProcessLookupError, PermissionError):
             continue
-        if real in opened:
-            found.append(command.parent.name)
+        if real in opened and process.name != str(plc):
+            found.append(process.name)
     return found
 
 

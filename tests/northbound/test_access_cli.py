@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ import pytest
 
 from gateway.cli.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
 from tests.conftest import Command
-from tests.e2e.processes import PATIENCE, Done, started, until_exit, vigor_line, write_config
+from tests.e2e.processes import PATIENCE, Done, held, started, until_exit, vigor_line, write_config
 from tests.northbound.access import (
     GATEWAY_RULES,
     PASSWORDS,
@@ -158,11 +157,8 @@ def test_a_gateway_that_stands_still_is_called_that(command: Command, tmp_path: 
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D1"}})}
     file = write_config(tmp_path / "c.yaml", free_endpoint(), lines)
     with started(file) as program:
-        os.kill(program.pid, signal.SIGSTOP)
-        try:
+        with held(program.pid):
             done = command("health", file)
-        finally:
-            os.kill(program.pid, signal.SIGCONT)
         assert (done.code, done.out) == (1, "")
         assert "takes connections and does not answer: that process stands still" in done.err
 

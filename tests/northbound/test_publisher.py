@@ -3,8 +3,6 @@
 import asyncio
 import itertools
 import json
-import os
-import signal
 import threading
 import time
 from dataclasses import replace
@@ -24,7 +22,7 @@ from gateway.tags import Reason, bad, good
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Decoder, Samples
 from gateway.tags.shaping import PLAIN, Bounds, Shaping
-from tests.e2e.processes import slowed
+from tests.e2e.processes import held, slowed
 from tests.northbound.plant import (
     PlainDevice,
     PlainPlant,
@@ -403,24 +401,10 @@ async def test_a_frozen_subscriber_does_not_block_the_event_loop() -> None:
     async with gateway_and_client(plant) as (northbound, client):
         await client.subscribe("plant/**")
         worst = 0.0
-        stopped = Stopped(client.pid)
-        with stopped:
+        with held(client.pid):
             for value in range(30):
                 before = time.perf_counter()
                 northbound.publish([plant.now(key, value) for key in plant.samples])
                 await asyncio.sleep(0.02)
                 worst = max(worst, time.perf_counter() - before)
         assert worst < slowed(0.5)  # one put to a frozen peer takes up to 50 ms, 2000 of them 100 s
-
-
-class Stopped:
-    """A process that SIGSTOP pauses."""
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-
-    def __enter__(self) -> None:
-        os.kill(self._pid, signal.SIGSTOP)
-
-    def __exit__(self, *_error: object) -> None:
-        os.kill(self._pid, signal.SIGCONT)
