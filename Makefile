@@ -150,7 +150,7 @@ sim: .venv/ready
 	    $(if $(RESULT),--result $(RESULT)) $(if $(WORKERS),--workers $(WORKERS))
 
 fuzz: .venv/ready
-	EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q tests/fuzz
+	EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -o faulthandler_timeout=0 tests/fuzz
 
 soak: .venv/ready
 	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
@@ -196,4 +196,4 @@ parsers: .venv/ready
 	$(BIN)/python -m tests.fuzz.long --minutes $(MINUTES)
 
 faults: .venv/ready
-	RESTARTS=200 $(BIN)/python -m pytest -q tests/faults
+	RESTARTS=200 $(BIN)/python -m pytest -q -o faulthandler_timeout=0 tests/faults

@@ -112,9 +112,10 @@ async def test_an_acknowledgement_survives_a_kill(tmp_path: Path) -> None:
                 done = await asyncio.to_thread(plc_gateway, "status", file)
                 assert (done.code, "alarms not saved: Is a directory" in done.out) == (1, True)
             waiting = keys
-            while waiting:  # a slow disk is told as such
-                answers = await client.many([(key, b'{"by": "Ana"}') for key in waiting])
-                waiting = [key for key, [one] in zip(waiting, answers, strict=True) if not one.ok]
+            async with asyncio.timeout(300):
+                while waiting:  # a slow disk is told as such
+                    answers = await client.many([(key, b'{"by": "Ana"}') for key in waiting])
+                    waiting = [k for k, [one] in zip(waiting, answers, strict=True) if not one.ok]
             first.end(signal.SIGKILL)
     with gateway("run", file) as second:
         second.says("Zenoh session ready")

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.processes import started, write_config
+from tests.northbound.plant import until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 WAIT = 0.9  # seconds that the bridge waits for a unit
@@ -77,8 +78,7 @@ async def test_a_dead_unit_behind_a_bridge_leaves_the_other_good(
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/alive/level", advanced=True)
                 await heard.next(lambda s: s.json["quality"] == "good")
-                while bridge.given_up < 3:
-                    await asyncio.sleep(0.05)
+                await until(lambda: bridge.given_up >= 3)
                 await client.get("plant/alive/level?max_age=0s")
         await bridge.closed.wait()
     bad = [sample.json for sample in heard.samples if sample.json["quality"] == "bad"]

@@ -37,8 +37,7 @@ async def test_a_filled_value_turns_bad_with_its_source_and_returns_with_it(tmp_
                 values = await client.subscribe(OWN)
                 master = Tcp(*await asyncio.open_connection("127.0.0.1", number))
                 for text in (READ, HELD):
-                    while await master.ask(text) != GOOD:
-                        await asyncio.sleep(0.05)
+                    await _answers_well(master, text)
                 # A client writes the third one: it is no value of the transfer any more.
                 [written] = await client.get("plant/hmi/own/@set", b"9")
                 assert written.json["value"] == 9
@@ -49,9 +48,13 @@ async def test_a_filled_value_turns_bad_with_its_source_and_returns_with_it(tmp_
                 assert await master.ask(HELD) == GOOD  # `hold_last` says so
                 assert await master.ask("03 0003 0001") == "03 02 00 09"
                 server.speaking.add(1)
-                async with asyncio.timeout(300):
-                    while await master.ask(READ) != GOOD:
-                        await asyncio.sleep(0.05)
+                await _answers_well(master, READ)
                 await master.close()
     finally:
         server.close()
+
+
+async def _answers_well(master: Tcp, text: str) -> None:
+    async with asyncio.timeout(300):
+        while await master.ask(text) != GOOD:
+            await asyncio.sleep(0.05)

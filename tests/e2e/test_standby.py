@@ -16,8 +16,9 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only the longest wait is shorter, so that the suite is.
 RUN = """
+import sys
 import gateway.northbound.group.election as election
-election.SETTLE_TIME = 2.0
+election.SETTLE_TIME = float(sys.argv.pop(1))
 from gateway.cli.main import main
 main()
 """
@@ -60,7 +61,14 @@ async def wire() -> AsyncIterator[tuple[Wire, int]]:
         server.close()
 
 
-def gateway(folder: Path, name: str, router: str, port: int, listen: Sequence[str] = ()) -> Program:
+def gateway(
+    folder: Path,
+    name: str,
+    router: str,
+    port: int,
+    listen: Sequence[str] = (),
+    settle: float = SETTLE_TIME,
+) -> Program:
     """`router`: where it connects to; empty for a gateway that only listens."""
     tags = {"speed": {"address": "D100"}, "run": {"address": "Y20", "write": True}}
     device = {"protocol": "vigor", "station": 1, "tags": tags}
@@ -72,7 +80,7 @@ def gateway(folder: Path, name: str, router: str, port: int, listen: Sequence[st
     }
     file = folder / f"{name}.yaml"
     file.write_text(json.dumps(text))
-    return Program(sys.executable, "-c", RUN, "run", file)
+    return Program(sys.executable, "-c", RUN, settle, "run", file)
 
 
 async def until_states(client: ZenohPeer, **stands: str) -> None:
@@ -165,7 +173,8 @@ async def test_a_router_that_visited_does_not_disable_the_standby(tmp_path: Path
     endpoint, port = free_endpoint(), free_port()
     with ExitStack() as programs:
         programs.enter_context(station("tcp", str(port)))
-        b = programs.enter_context(gateway(tmp_path, "b", "", port, [endpoint]))
+        # So long b waits for a: on a busy machine a starts late.
+        b = programs.enter_context(gateway(tmp_path, "b", "", port, [endpoint], settle=10))
         a = programs.enter_context(gateway(tmp_path, "a", endpoint, port))
         await says(a, "device online")
         async with ZenohPeer("router", connect=[endpoint]):
