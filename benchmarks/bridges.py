@@ -24,11 +24,10 @@ from typing import Any, NamedTuple
 
 from gateway.bridges.mqtt.sparkplug.messages import Payload
 from gateway.northbound.publishing.slow_puts import SlowPuts
-from tests.bridges.campaign import stopped
 from tests.bridges.campaign_clients import InfluxServer
 from tests.bridges.played import PlayedGateway
 from tests.conftest import needs
-from tests.e2e.processes import Program, free_port, listens, until
+from tests.e2e.processes import Program, free_port, held, listens, until
 from tests.zenoh_peer import free_endpoint
 
 PER_DEVICE = 1000
@@ -181,7 +180,7 @@ def measure(
             before, used = reader.count, processor(bridge.pid)
             began = time.monotonic()
             sent = plant.publish_for(seconds, rate)
-            with stopped(bridge) if hold else nullcontext():
+            with held(bridge.pid) if hold else nullcontext():
                 plant.publish_for(hold, rate)
             ended, used = time.monotonic(), processor(bridge.pid) - used
             reader.look()

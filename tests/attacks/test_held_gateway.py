@@ -113,21 +113,22 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
     device = {"protocol": "modbus-tcp", "station": 1, "reply_timeout": "20s", "tags": tags}
     with ExitStack() as programs:
         async with peer(plc.serve) as port, ZenohPeer("router", listen=[router]):
-            a, b = (
-                programs.enter_context(Program(sys.executable, "-c", RUN, "run", file))
-                for file in (
-                    write_config(
-                        tmp_path / f"{name}.yaml",
-                        router,
-                        {"net": {"port": f"tcp://127.0.0.1:{port}", "devices": {"mixer": device}}},
-                        gateway={"name": name, **group},
-                        zenoh={"listen": [], "connect": [router], "config_file": "zenoh.json5"},
-                    )
-                    for name in "ab"
+            files = [
+                write_config(
+                    tmp_path / f"{name}.yaml",
+                    router,
+                    {"net": {"port": f"tcp://127.0.0.1:{port}", "devices": {"mixer": device}}},
+                    gateway={"name": name, **group},
+                    zenoh={"listen": [], "connect": [router], "config_file": "zenoh.json5"},
                 )
-            )
+                for name in "ab"
+            ]
+            commands = [(sys.executable, "-c", RUN, "run", file) for file in files]
             async with ZenohPeer("client", connect=[router]) as client:
+                a = programs.enter_context(Program(*commands[0]))
                 await asyncio.to_thread(a.says, "device online")
+                b = programs.enter_context(Program(*commands[1]))
+                await asyncio.to_thread(b.says, "Zenoh link up")
                 for value in range(70, 78):
                     await client.put(RECIPE, b"%d" % value)
                 await plc.written.wait()

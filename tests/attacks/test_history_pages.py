@@ -10,7 +10,7 @@ from typing import Any
 from gateway.parts.history.store.file import HistoryFile
 from gateway.tags import good
 from tests.e2e.paced_link import paced_link
-from tests.e2e.processes import Program, started, write_config
+from tests.e2e.processes import Program, slowed, started, write_config
 from tests.history.recorded import NOON, SECOND, store_run
 from tests.history_writer import tag
 from tests.zenoh_peer import Reply, ZenohPeer, free_endpoint
@@ -150,7 +150,7 @@ async def test_a_client_that_reads_slowly_behind_large_buffers_gets_all(tmp_path
         paced_link(endpoint, rate=2_000_000, large=True) as link,
         ZenohPeer("client", connect=[link.endpoint]) as client,
     ):
-        replies = await client.get("plant/**?_time=[..]", timeout=90, consolidation="NONE")
+        replies = await client.get("plant/**?_time=[..]", timeout=slowed(90), consolidation="NONE")
         assert len(shown(replies)) == RUNS * many
         assert link.connections == 1
 

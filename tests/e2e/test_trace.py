@@ -8,7 +8,7 @@ import pytest
 
 from gateway.cli.line.replay import replay
 from tests.attacks.slave import crc
-from tests.e2e.processes import plc_gateway, started, write_config
+from tests.e2e.processes import plc_gateway, slowed, started, write_config
 from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint
 
 BAUD = 9600
@@ -83,7 +83,15 @@ async def test_a_listen_only_line_learns_what_another_master_reads(
                 news = await client.subscribe("plant/**")
                 await news.until(lambda told: len(values(told, "copy")) >= ENOUGH)
                 [refused] = await client.get("plant/copy/count/@set", b"5")
-                record = "trace", config, "ear", "--for", "600ms", "--record", recording
+                record = (
+                    "trace",
+                    config,
+                    "ear",
+                    "--for",
+                    f"{slowed(0.6):.1f}s",
+                    "--record",
+                    recording,
+                )
                 assert (await asyncio.to_thread(plc_gateway, *record)).code == 0
             assert gateway.end() == 0
     copied, polled_values = values(news, "copy"), values(news, "meter")

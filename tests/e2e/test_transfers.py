@@ -76,6 +76,7 @@ async def test_a_value_is_carried_and_its_row_goes_on_over_a_reload(tmp_path: Pa
             os.kill(program.pid, signal.SIGHUP)
             await asyncio.to_thread(program.says, "file reloaded")
             await outcomes.next(lambda s: s.json["key"] == "plant/mixer/run")
+            await client.get_until(f"{OWN}/transfers/1", lambda row: row["state"] == "carried")
             documents = {
                 str(reply.key).removeprefix(f"{OWN}/"): reply.json
                 for reply in await client.get(f"{OWN}/**")
