@@ -42,7 +42,7 @@ from gateway.engine.results.staleness import Staleness
 from gateway.engine.rules import LineState, rules_of
 from gateway.engine.schedule.in_flight import HeldRead, InFlight
 from gateway.engine.schedule.schedule import Schedule
-from gateway.errors import BadValue, Busy, Lent, LineDown, Superseded
+from gateway.errors import BadValue, Busy, Lent, LineDown, Superseded, Unclear
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Reason, Tag
 
@@ -195,6 +195,9 @@ class Engine:
     ) -> None:
         """Passes the result to the rules, and counts it. `good`: the job ended well."""
         device, rules = job.device, self.rules
+        if traffic.strange or (traffic.heard and isinstance(result, Unclear)):
+            for other in self.devices:  # another computer may have registered a list
+                other.monitor.forget()
         if not good or rules.troubled:
             after = rules.after(device, good=good)
         else:
@@ -203,7 +206,9 @@ class Engine:
             concluded(job, result, traffic, now, time)
         characters = (traffic.sent + traffic.heard) * self.wire.character
         self.record.count(characters, traffic.turnaround)
-        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
+        own = not (traffic.doubtful and device.is_doubtful) or isinstance(job, Probe)
+        exchanges, turnaround = traffic.exchanges, traffic.turnaround
+        device.record.count_exchanges(exchanges, characters, turnaround, traffic.ahead, own=own)
         if device.shapes is not None:
             device.shapes.at = now
 

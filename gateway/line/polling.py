@@ -6,7 +6,7 @@ from typing import Any
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Poll, Result, Traffic
-from gateway.errors import BadValue, Busy, DeviceError, Evidence, LineDown, Unsteady
+from gateway.errors import BadValue, Busy, DeviceError, Evidence, Garbled, LineDown, Unsteady
 from gateway.line.channel import Channel
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
@@ -14,13 +14,20 @@ from gateway.protocols.capabilities import Monitor
 from gateway.protocols.driver import Span, Talk
 
 DIFFER = "two readings in a row differ; verify_reads is for values that change slowly"
+OTHER_LIST = "another computer spoke meanwhile: it may have registered a monitor list of its own"
 RESULTS = (DeviceError, BadValue, LineDown, Busy)  # errors that are results of a job
 
 
-async def read_poll(poll: Poll, talk: Talk[Any]) -> Sequence[int]:
-    """Returns the units of the span of the poll."""
+async def read_poll(poll: Poll, talk: Transaction) -> Sequence[int]:
+    """Returns the units of the span of the poll.
+
+    Raises `Garbled` if the PLC may have got another monitor list meanwhile.
+    """
     device, block = poll.device, poll.block
-    return await read_with_care(talk, device, block, span=poll.span, register=poll.register)
+    units = await read_with_care(talk, device, block, span=poll.span, register=poll.register)
+    if block.listed and talk.traffic.strange:
+        raise Garbled(OTHER_LIST, evidence=Evidence.SHAPE)
+    return units
 
 
 async def read_with_care(

@@ -9,6 +9,8 @@ from gateway.engine.jobs.jobs import Settled
 from gateway.errors import DeviceError, Evidence, Garbled, NoReply
 from gateway.line.channel import KEPT, Channel
 
+MOST_WAITS = 100  # in one transaction
+
 
 def verdict(request: bytes, heard: bytes, early: bytes, stray: Evidence | None) -> DeviceError:
     """Returns the end of a request without a reply. `heard`: since it was sent; `early`: in place
@@ -38,6 +40,7 @@ class LateReply:
     answers: Callable[[Any], Any] | None = None  # None: noise was heard, and no reply is awaited
     takes_refusals: bool = False  # an error reply names no request: it may be the late one
     arrived: bool = False
+    waits: int = 0
     _awaited: "asyncio.Future[None] | None" = None
 
     def is_it(self, frame: Any) -> bool:
@@ -65,6 +68,9 @@ class LateReply:
         """
         channel, start = self.channel, self.channel.now()
         until = start + guard
+        self.waits += 1
+        if self.waits > MOST_WAITS:  # without time, all lines would stand still
+            raise RuntimeError("the line waits for quiet without end")
         while self.answers is None and channel.lost_by is None:
             quiet = channel.quiet_since + gap
             if min(quiet, until) <= channel.now():

@@ -16,6 +16,7 @@ from gateway.protocols.driver import Codec, EndedByGap
 
 T = TypeVar("T")
 MOST_REMEMBERED = 4096  # bytes of one reply
+SHORTEST_COMMAND = 8  # characters of another computer; fewer are noise
 
 
 @dataclass(slots=True, eq=False)
@@ -151,11 +152,14 @@ class Transaction:
         traffic.exchanges += 1
         own = answered - alone - busy
         too_soon = own < device.record.replies.soonest and device.shapes is not None
+        too_soon = too_soon and device.record.replies.is_too_soon(own, busy)
         if too_soon or request.equal:
             unproven = started - channel.echo.absent_at
             traffic.doubtful |= too_soon or device.may_be_echo(own, unproven)
         if own > 0.0:
             traffic.turnaround += own
+        else:
+            traffic.ahead = min(traffic.ahead, own / busy)
         return answer
 
     def _send(self, data: bytes, now: float) -> None:
@@ -178,6 +182,8 @@ class Transaction:
 
     def _begin_hearing(self) -> None:
         """Drops earlier bytes: they must not become part of the reply."""
+        if len(self._heard) >= SHORTEST_COMMAND and self._stray is None:
+            self.traffic.strange = True
         if self._heard or self.traffic.heard or self._broken is not None:
             self._codec = self._device.settings.driver.codec()
             self._broken = None
@@ -280,6 +286,7 @@ class Transaction:
         foreign = not old and getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
+        self.traffic.strange |= not is_echo and self._may_be_reply(frame)
         if not is_echo and not foreign and not old and self._may_be_reply(frame):
             self.traffic.extra += 1
             self.traffic.contradicted |= self._contradicts(frame)
@@ -312,8 +319,14 @@ class Transaction:
             request.equal = echo.absent_by_evidence and frame == request.frame
         else:
             echo.absent_at = self._channel.quiet_since
-        request.heard, self._heard = len(self._heard), b""
-        self._replied, self.traffic.contradicted = (frame, request.answers), False
+        request.heard = len(self._heard)
+        beyond = request.heard - request.reply
+        if beyond >= SHORTEST_COMMAND and self._stray is None:
+            own = len(request.data) if request.data in self._heard else 0  # its echo
+            self.traffic.strange |= beyond - own >= SHORTEST_COMMAND
+        self._heard = b""
+        self._replied = self.traffic.replied = frame, request.answers
+        self.traffic.contradicted = False
         request.future.set_result(answer)
 
     def _takes_late(self, frame: Any) -> bool:

@@ -5,8 +5,8 @@ exist. The block is halved, then the failed half, until the bad address stands a
 planner covers all other addresses again, with cuts around the bad ones.
 
 If both halves are read although their block failed, the block may be too long for the device, or
-noise hit it. So the block is tried once more as a whole. It is split if it fails again, and tried
-as a whole again after growing pauses.
+noise hit it. So the block is tried once more as a whole. It is split if it fails again. After
+growing pauses its splits are dropped again, one at a time.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -131,6 +131,8 @@ class BadAddresses:
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
     _rejoin_at: float | None = None
     _rejoin_pause: float = SPLIT_FIRST
+    _tried: Cut | None = None  # the split that was dropped last, of so many
+    _tried_of: int = 0
 
     @property
     def cuts(self) -> Cuts:
@@ -218,17 +220,27 @@ class BadAddresses:
         return True
 
     def rejoin(self, now: float) -> bool:
-        """Drops the splits after a pause. Returns True if the device is to be planned again."""
+        """Drops the next split after a pause: each that is still needed costs time-outs.
+
+        If the whole block is read, the split after it follows at once. Returns True if the device
+        is to be planned again.
+        """
         if not self.splits:
             return False
         if self._rejoin_at is None:
             self._rejoin_at = now + self._rejoin_pause
-        if now < self._rejoin_at:
+        searching = self.searches or self._suspected
+        fewer = not searching and len(self.splits) < self._tried_of
+        if now < self._rejoin_at and not fewer:
             return False
-        self._rejoin_pause = min(2 * self._rejoin_pause, SPLIT_LONGEST)
-        self.changed |= {Span(area, n - 1, 2) for area, n in self.splits}
-        self._suspected |= self.splits  # one search is enough to find them again
-        self.splits.clear()
+        left = [cut for cut in self.splits if self._tried is None or cut > self._tried]
+        if not left or self._tried is None:  # a round begins
+            self._rejoin_pause = min(2 * self._rejoin_pause, SPLIT_LONGEST)
+        self._tried_of, self._tried = len(self.splits), min(left or self.splits)
+        area, n = self._tried
+        self.changed.add(Span(area, n - 1, 2))
+        self._suspected.add(self._tried)  # one search is enough to find it again
+        self.splits.remove(self._tried)
         self._rejoin_at = None
         return True
 
@@ -261,6 +273,7 @@ class BadAddresses:
         suspected = old._suspected.union(*ended)
         self._suspected |= {cut for cut in suspected if _is_inside(cut, blocks)}
         self._rejoin_at, self._rejoin_pause = old._rejoin_at, old._rejoin_pause
+        self._tried, self._tried_of = old._tried, old._tried_of
         self._look()
 
     def known(self) -> KnownBad:

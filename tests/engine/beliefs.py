@@ -12,6 +12,7 @@ from gateway.engine.device.records import QUICKEST_OF
 from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
 from gateway.engine.device.turnaround import LEARN_EVERY
+from gateway.engine.device.twins import FOR
 from gateway.engine.jobs.unanswered import SEEN_FOR
 from gateway.engine.results.bit_writes import LACKED_FOR
 from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
@@ -82,6 +83,13 @@ BELIEFS = (
         "no such reply for ten minutes",
         "reads of its line need no proof; fewer shapes, shorter waits",
         WARY_FOR,
+    ),
+    Belief(
+        "two stations have its number",
+        "half of its last 16 requests were answered again, and a reply differed",
+        "requests that are answered once, or ten minutes without a difference",
+        "a reply that came alone is a value again, with its proof",
+        FOR,
     ),
     Belief(
         "takes one request at a time",

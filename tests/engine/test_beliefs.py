@@ -11,6 +11,7 @@ from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
 from gateway.engine.device.probe_pace import PROBE_SPREAD
 from gateway.engine.device.records import QUICKEST_OF, Replies
 from gateway.engine.device.reply_shapes import ProofPace
+from gateway.engine.device.twins import Twins
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
@@ -116,6 +117,16 @@ def answers_twice() -> Way:
 
     assert not given_up(60.0)
     return given_up
+
+
+def twins() -> Way:
+    known = Twins()
+    for second in range(int(HOUR)):
+        known.asked()
+        known.replied((7, lambda frame: frame))
+        known.arrived(8, float(second))
+    assert known.exist(HOUR)
+    return lambda after: not known.exist(HOUR - 1 + after)
 
 
 def one_at_a_time() -> Way:
@@ -400,6 +411,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "a shorter silence is enough": shorter_silence,
     "a silence is too short": silence_too_short,
     "answers twice": answers_twice,
+    "two stations have its number": twins,
     "takes one request at a time": one_at_a_time,
     "refused address": refused_address,
     "block too long": block_too_long,
@@ -446,8 +458,24 @@ def test_a_reply_comes_too_soon_only_after_many_and_with_the_true_baudrate() -> 
     replies = Replies()
     for _ in range(QUICKEST_OF - 1):
         replies.count(0.01)
-        assert replies.soonest < 0.0
+        assert not replies.is_too_soon(-0.02, 0.01)
     replies.count(0.01)
     assert replies.soonest == pytest.approx(0.005)
-    replies.count(0.0)  # the wire is faster than the file says
-    assert replies.soonest < -1.0
+    assert replies.is_too_soon(0.004, 0.01)
+    assert not replies.is_too_soon(0.005, 0.01)
+    replies.count(0.0, -0.5)  # another reply: the station itself is as quick as before
+    assert replies.is_too_soon(-0.005, 0.01)
+    for _ in range(2 * QUICKEST_OF):
+        replies.count(0.0, -0.5)  # the wire is faster than the file says
+    assert not replies.is_too_soon(-0.005, 0.01)
+    assert replies.is_too_soon(-0.006, 0.01)
+    replies.count(0.0, -0.9)  # a longer read
+    assert not replies.is_too_soon(-0.009, 0.01)
+
+
+def test_a_reply_without_any_turnaround_comes_too_soon_before_its_characters_are_over() -> None:
+    replies = Replies()
+    for _ in range(QUICKEST_OF):
+        replies.count(0.0)
+    assert replies.is_too_soon(-0.004, 0.03)
+    assert not replies.is_too_soon(-0.0001, 0.03)  # the clock of a station may be fast

@@ -8,6 +8,7 @@ from gateway.engine.results.second_requests import (
     leave_second,
     second_token,
 )
+from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from tests.sim.bench import WIRE
@@ -127,3 +128,25 @@ def test_a_minute_without_a_late_reply_ends_it() -> None:
     for size in (1, 2, 3, 4):
         plc.shapes.also_sent(plc.shapes.of(Span("holding", 0, size)), now)
     assert chosen(plc, 3, now)
+
+
+def test_where_no_other_form_is_left_the_line_is_quiet_once_not_for_ever() -> None:
+    """The gateway stood still: the quiet before the first choice was asked for without end."""
+    plc, one = made(*SINGLE), Span("holding", 100, 1)
+    plc.health.left_outstanding(None, 0.0)
+    plc.health.spoke(0.5, plc.longest_reply)
+    plc.note_resync(one, 3, 1.0)
+    leave_second(plc, one, 3, 1.0)
+    lateness = plc.health.probes.lateness(1.0)
+    assert lateness > 0
+    assert second_token(plc, one, 3, 1.0) == (3, lateness)
+    assert second_token(plc, one, 3, 1.01 + lateness) == (3, 0.0)
+
+
+def test_a_loopback_without_a_reply_is_not_remembered() -> None:
+    driver = ComputerLink(station=1)
+    tags = [make_tag(f"D{n}", driver, device="plc", type="uint16") for n in (0, 100)]
+    plc = made_device("plc", driver, WIRE, driver.timing, tags)
+    assert form(plc, None, 3) is None
+    leave_second(plc, None, 3, 1.0)
+    assert not plc.health.unanswered.seconds

@@ -6,6 +6,8 @@ import random
 import pytest
 
 from gateway.engine.device.health import State
+from gateway.engine.engine import Engine
+from gateway.engine.jobs.jobs import Probe, Settle
 from gateway.errors import Busy, Offline, Unclear
 from gateway.tags import WriteResult, WriteRule
 from tests.line.clocks import clocks, wind_up
@@ -106,3 +108,20 @@ async def test_a_late_acknowledgement_never_confirms_another_write(late_acks: fl
     sent = [data for _, data in line.writes_sent()]
     assert len(done) > 300
     assert len(sent) == len(set(sent))  # every write had its own value
+
+
+@on_virtual_time
+async def test_a_line_that_waits_for_quiet_without_end_falls_and_opens_again() -> None:
+    """An engine error: the wait takes no time, so no other line would get its turn."""
+    line = plant([clocks(10)])
+    engine = line.line.engine
+    async with running(line):
+        await asyncio.sleep(2)
+        settle = Settle(line.devices[0], 0.0, 0.0, Probe(line.devices[0], None, 1))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Engine, "next", lambda *_: settle)
+            patch.setattr(Engine, "conclude", lambda *_: [])
+            await asyncio.sleep(0.2)
+        assert "waits for quiet without end" in engine.record.trouble
+        await asyncio.sleep(5)
+        assert line.good(line.devices[0])

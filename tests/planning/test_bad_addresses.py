@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.engine.device.device import Device
-from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
+from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST, KnownBad
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span
 from tests.sim.plant import device, make_tag
@@ -254,3 +254,27 @@ def test_an_address_known_to_be_bad_from_an_earlier_run_is_read_rarely() -> None
     earlier.bad_addresses.refused(earlier.blocks[0], 0, "28")
     found.bad_addresses.restore(earlier.bad_addresses.known(), found.tags)
     assert found.interval(found.blocks[0]) == RETRIES[-1]
+
+
+def test_splits_are_tried_one_by_one_and_the_next_at_once_where_one_is_not_needed() -> None:
+    """All were dropped together: a device with 20 silent gaps was offline for two minutes."""
+    found = words(*range(16))
+    bad = found.bad_addresses
+    cuts = [("D", 4), ("D", 8), ("D", 12)]
+    bad.restore(KnownBad((), tuple(cuts)), found.tags)
+    found.plan()
+    assert not bad.rejoin(0.0)
+    assert bad.rejoin(SPLIT_FIRST)
+    assert bad.cuts == {("D", 8), ("D", 12)}
+    found.plan()
+    bad.read(found.blocks[0])  # D0 to D7
+    assert bad.rejoin(SPLIT_FIRST + 1.0)
+    assert bad.cuts == {("D", 12)}
+    found.plan()
+    first, second = bad.refused(found.blocks[0], 0, SILENT)  # D0 to D11
+    bad.read(first)
+    bad.read(second)
+    assert bad.settle(SPLIT_FIRST + 2.0)
+    assert not bad.rejoin(SPLIT_FIRST + 3.0)  # another split may take its place
+    assert bad.rejoin(10 * SPLIT_FIRST)  # the third
+    assert bad.cuts == set()

@@ -262,7 +262,7 @@ class World:
         """Changes one device of the file at a time: no value and no write may be wrong for that."""
         chance = random.Random(f"reload {self.story.seed}")
         pause = chance.choice((10.0, 60.0, 600.0))
-        while True:
+        while self.devices:
             await asyncio.sleep(chance.expovariate(1 / pause))
             name = chance.choice(sorted(self.devices))
             old, line = self.devices[name], self._buses[name].line

@@ -12,6 +12,7 @@ DAY = 86_400.0  # seconds
 MOST_FALLS = 1000  # times that are kept: one each 86 s of a day
 LATELY = 32  # requests whose ends are kept
 QUICKEST_OF = 50  # exchanges
+FASTER = 0.03  # by which the clock of a station may be fast
 SOONER = 0.002  # seconds, at least, by which a reply comes sooner than the station can reply
 MOST_RESULTS = 20  # a modem that says noise does not fill the memory
 
@@ -193,25 +194,49 @@ class Replies:
     turnaround: float | None = None  # smoothed over about ten exchanges
     quickest: float = math.inf  # of many recent exchanges
     soonest: float = -math.inf  # a reply that comes sooner may be another one
+    # Replies come before their characters can be over, by this share of their time; <= 0
+    ahead: float = 0.0
     _quickest_now: float = math.inf  # of those that are counted at present
+    _ahead_now: float = 0.0
+    _early: int = 0
     _counted: int = 0
 
-    def count(self, own: float) -> None:
+    def count(self, own: float, ahead: float = 0.0) -> None:
+        """Counts a turnaround. `ahead`: it came before its characters could be over; <= 0."""
         known = self.turnaround
         self.turnaround = own if known is None else known + 0.1 * (own - known)
-        if own < self._quickest_now:
+        if ahead < -FASTER:
+            self._early += 1
+            self._ahead_now = min(self._ahead_now, ahead)
+            if self.ahead:
+                self.ahead = min(self.ahead, ahead)
+        elif own < self._quickest_now:
             self._quickest_now = own
             self.soonest = min(self.soonest, _soonest(own))
         self._counted += 1
         if self._counted >= QUICKEST_OF:
-            self.quickest, self._quickest_now, self._counted = self._quickest_now, math.inf, 0
-            self.soonest = _soonest(self.quickest)
+            self._begin_again()
+
+    def _begin_again(self) -> None:
+        # A few that came early are others. If most do, the wire is faster than the file says.
+        self.ahead = self._ahead_now if 2 * self._early > self._counted else 0.0
+        self.quickest = 0.0 if self.ahead else self._quickest_now
+        self.soonest = _soonest(self.quickest)
+        self._quickest_now, self._ahead_now, self._early, self._counted = math.inf, 0.0, 0, 0
+
+    def is_too_soon(self, own: float, busy: float) -> bool:
+        """Returns True if the station cannot have replied with this turnaround: it may be below 0.
+
+        `busy`: seconds of the characters.
+        """
+        if self.soonest > 0.0:
+            return own < self.soonest
+        return own < min(self.soonest, (self.ahead - FASTER) * busy)
 
 
 def _soonest(quickest: float) -> float:
-    """Returns the turnaround below which a reply comes too soon. Without any turnaround the wire
-    is faster than the file says, and nothing is known."""
-    return quickest - max(quickest / 2, SOONER) if quickest > 0.0 else -math.inf
+    """Returns the turnaround below which a reply comes too soon."""
+    return max(quickest - max(quickest / 2, SOONER), 0.0)
 
 
 @dataclass(slots=True)
@@ -234,13 +259,26 @@ class Record:
     replies: Replies = field(default_factory=Replies)
     slowest_write: float = 0.0
 
-    def count_exchanges(self, exchanges: int, characters: float, turnarounds: float) -> None:
-        """Counts requests with a reply, and the seconds of their characters and turnarounds."""
+    def count_exchanges(
+        self,
+        exchanges: int,
+        characters: float,
+        turnarounds: float,
+        ahead: float = 0.0,
+        *,
+        own: bool = True,
+    ) -> None:
+        """Counts requests with a reply, and the seconds of their characters and turnarounds.
+
+        `ahead`: as in `Replies.count`. `own` False: a reply may be another one, and says nothing of
+        the station.
+        """
         self.wire_time += characters + turnarounds
         if exchanges:
             self.recent.ends.append("")
             self.exchanges += exchanges
-            self.replies.count(turnarounds / exchanges)
+            if own:
+                self.replies.count(turnarounds / exchanges, ahead)
 
     def count_write(self, took: float) -> None:
         self.writes += 1

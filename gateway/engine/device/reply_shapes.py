@@ -8,10 +8,11 @@ addresses more. An extra reply then arrives as a stray frame.
 
 from collections import deque
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.engine.device.long_writes import LongWrite
 from gateway.engine.device.longer_reads import MOST_CHOICES, LongerReads
+from gateway.engine.device.twins import Twins
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.planner import Block
 from gateway.protocols.capabilities import UnnumberedReplies
@@ -68,6 +69,7 @@ class ProofPace:
 
     # Until then it is silent about the reads that the second request of a resync may have.
     seconds_from: float = -NEVER
+    twins: Twins = field(default_factory=Twins)
 
     def ended(self, *, proven: bool) -> None:
         """Notes the end of reads that waited for one resync."""
@@ -148,6 +150,8 @@ class ReplyShapes:
             self.collided = now - longest_ago < self.quiet
         used[shape] = now
         self._recent.append(shape)
+        if self.quiet == WARY:
+            self.proofs.twins.asked()
         self.last, self.span = shape, read
         return read
 
@@ -199,6 +203,8 @@ class ReplyShapes:
 
     def _sent(self, shape: Hashable, now: float) -> None:
         self._recent.append(shape)
+        if self.quiet == WARY:
+            self.proofs.twins.asked()
         if now - self.at >= self.quiet:
             self._prove(now)
         self.last = shape

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
+from gateway.engine.device.twins import Replied
 from gateway.engine.jobs.requests import Command, Request, Write
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
@@ -200,9 +201,12 @@ class Traffic:
     heard: int = 0  # characters
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
+    ahead: float = 0.0  # of a reply before its characters could be over, to these; <= 0
     extra: int = 0  # frames of the station that answered no request
     contradicted: bool = False  # one of them could be the reply to the last request, too
+    strange: bool = False  # characters arrived that were no part of a reply: another computer?
     silence: float = math.inf  # seconds before its request, the shortest of several
+    replied: Replied | None = None  # the last
     doubtful: bool = False  # a reply may be another one, or the echo of its request
 
 

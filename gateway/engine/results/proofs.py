@@ -36,6 +36,7 @@ class Proofs:
         """Holds the values of a good read."""
         device, now = read.poll.device, read.now
         self._in_flight.hold(read)
+        self._replied(device, traffic)
         if traffic.extra:
             self._results.answered_twice(device, now, read.time)
         if _may_be_alone(read.poll, traffic):
@@ -70,9 +71,15 @@ class Proofs:
         """Takes what arrived for a resync: extra replies, or a refusal of its read."""
         if traffic.extra:
             self._in_flight.doubt()
+        self._replied(probe.device, traffic)
         shapes = probe.device.shapes
         if probe.token == PROOF and isinstance(result, Refused) and shapes is not None:
             shapes.proofs.lacks(now)
+
+    @staticmethod
+    def _replied(device: Device, traffic: Traffic) -> None:
+        if device.shapes is not None:
+            device.shapes.proofs.twins.replied(traffic.replied)
 
     def resynced(self, probe: Probe, told_from: int, now: float, time: int) -> None:
         """Releases the reads that waited for this resync, if no extra reply has arrived.
@@ -96,6 +103,7 @@ class Proofs:
         held, doubted = self._in_flight.release()
         proven = proven and not doubted
         if held and (shapes := held[0].poll.device.shapes) is not None:
+            proven = proven and not shapes.proofs.twins.exist(now)
             shapes.proofs.ended(proven=proven)
         for read in held:
             if proven:
@@ -107,10 +115,10 @@ class Proofs:
 def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
     """Returns True if the reply may be another one, and no own reply may follow it.
 
-    The station had no reply to this read last time. Or it replies much sooner otherwise, and an
-    earlier reply with this shape may arrive once more.
+    The station had no reply to this read last time. Or it cannot reply so soon, on a doubtful line.
+    Or it replies much sooner otherwise, and an earlier reply with this shape may arrive once more.
     """
-    if poll.missed:
+    if poll.missed or (traffic.doubtful and poll.device.is_doubtful):
         return True
     shapes, late = poll.device.shapes, poll.device.late_from
     collided = shapes is not None and shapes.collided

@@ -33,9 +33,8 @@ def second_token(
         shape = shapes.of_resync(outstanding, one, spans)
         if shape in inside and (at := shapes.used_at(shape)) < longest_ago:
             found, longest_ago = one, at
-    lateness = health.probes.lateness(now)
-    unanswered = shapes.of_resync(outstanding, found, spans) in health.unanswered.seconds
-    if unanswered and now - longest_ago < lateness:
+    lateness, shape = health.probes.lateness(now), shapes.of_resync(outstanding, found, spans)
+    if shape in health.unanswered.seconds and now - shapes.used_at(shape) < lateness:
         return found, lateness
     device.note_resync(outstanding, found, now)
     return found, 0.0
@@ -45,7 +44,10 @@ def leave_second(device: Device, outstanding: Span | None, token: int, now: floa
     """Notes that a second request has no reply."""
     shapes, seconds = device.shapes, device.health.unanswered.seconds
     if shapes is not None:
-        seconds.append(shapes.of_resync(outstanding, token, device.probe_spans))
+        shape = shapes.of_resync(outstanding, token, device.probe_spans)
+        if shape is None:  # no other reply can have it
+            return
+        seconds.append(shape)
         if len(seconds) >= MOST_SILENT and not device.health.probes.was_late(now):
             shapes.proofs.lacks_seconds(now)
 

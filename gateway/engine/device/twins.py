@@ -1,0 +1,53 @@
+"""A second station with the number of a device: it replies to the same requests."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from gateway.errors import DeviceError
+
+Replied = tuple[Any, Callable[[Any], Any]]  # a reply, and what tells another reply to its request
+KEPT = 16  # requests
+FOR = 600.0  # seconds
+
+
+class Twins:
+    """Learns of a second station from replies that answer the last request once more.
+
+    A device server that repeats replies sends equal ones. A second master gets replies to its own
+    requests. Only a second station answers most requests again, and says something else at times.
+    Then a reply that came alone may be that of either.
+    """
+
+    __slots__ = ("_again", "_differed", "_last")
+
+    def __init__(self) -> None:
+        self._last: Replied | None = None
+        self._again = deque[bool](maxlen=KEPT)  # of each request
+        self._differed = -FOR
+
+    def asked(self) -> None:
+        """Notes a request to the device."""
+        self._again.append(False)
+
+    def replied(self, last: Replied | None) -> None:
+        """Notes the last reply to it."""
+        self._last = last
+
+    def arrived(self, frame: Any, now: float) -> None:
+        """Takes a frame that answers no open request."""
+        if self._last is None or not self._again:
+            return
+        reply, answers = self._last
+        try:
+            again = answers(frame) is not None
+        except DeviceError:
+            again = True
+        if again:
+            self._again[-1] = True
+            if frame != reply:
+                self._differed = now
+
+    def exist(self, now: float) -> bool:
+        """Returns True if two stations answer."""
+        return now - self._differed < FOR and 2 * sum(self._again) >= len(self._again)
