@@ -102,7 +102,7 @@ class Northbound:
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
         self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
-        index = TagIndex(self.keys, plant.devices())
+        index = TagIndex(self.keys, plant.devices(), plant.tag)
         self.admission = Admission(group, self.keys, self._config, index.names, plant.duty)
         losses = SlowPuts(drop_limit(self._config))
         self._publisher = Publisher(losses, index)

@@ -4,6 +4,8 @@ A block qualifies if each of its tags is one number of its own words, and one or
 all: words of a read become bytes, and the bytes numbers. Bits, texts, digits and arrays do not.
 """
 
+import sys
+from array import array
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from operator import index
@@ -71,4 +73,14 @@ def _orders(layout: Layout, words: int) -> set[tuple[str, str]]:
 @lru_cache(maxsize=4096)  # blocks of equal devices share it
 def _unpack(words: str, octets: str, count: int, form: str) -> Unpack:
     pack, unpack = Struct(f"{words}{count}H").pack, Struct(f"{octets}{form}").unpack
-    return lambda units: unpack(pack(*units[:count]))
+    swaps = (words == _LITTLE) is not (sys.byteorder == "little")
+
+    def found(units: Sequence[int]) -> tuple[Any, ...]:
+        if not (isinstance(units, array) and units.typecode == "H"):
+            return unpack(pack(*units[:count]))
+        some = units[:count]  # in the order of this machine: no word becomes an object
+        if swaps:
+            some.byteswap()
+        return unpack(some)
+
+    return found

@@ -35,7 +35,7 @@ class Rig:
         keys = Keys("plant", "demo")
         self.plant = plant
         self.audit: list[WriteOutcome] = []
-        index = TagIndex(keys, plant.devices())
+        index = TagIndex(keys, plant.devices(), plant.tag)
         accepts = Acceptance(SendPermit(), None)
         self.writes = Writes(plant, index, self.audit.append, accepts)
 

@@ -68,7 +68,7 @@ async def test_values_are_put_in_the_order_of_their_time_stamps() -> None:
 
 
 def a_publisher() -> Publisher:
-    return Publisher(SlowPuts(1.0), TagIndex(KEYS, ()))
+    return Publisher(SlowPuts(1.0), TagIndex(KEYS, (), lambda _key: None))
 
 
 class StuckSession:

@@ -52,7 +52,7 @@ def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time(event: bo
 async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
     code, weight = tag("reader", "code", event=True), tag("reader", "weight")
     plant = PlainPlant(PlainDevice("reader", (code, weight)))
-    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    index = TagIndex(Keys("plant", "demo"), plant.devices(), plant.tag)
     published: list[Sample] = []
     losses = SlowPuts(1.0)
     republisher = Republisher(published.extend, plant, index, LinkMonitor(), losses, 600.0, nothing)
@@ -76,7 +76,7 @@ async def test_the_plant_marks_republished_samples_before_they_go_out() -> None:
         published.extend(samples)
         assert plant.republished == published
 
-    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    index = TagIndex(Keys("plant", "demo"), plant.devices(), plant.tag)
     await Republisher(
         publish, plant, index, LinkMonitor(), SlowPuts(1.0), 600.0, nothing
     ).publish_all()
@@ -137,7 +137,7 @@ async def test_no_value_is_put_before_there_is_a_link() -> None:
 
 
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
-    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    index = TagIndex(Keys("plant", "demo"), plant.devices(), plant.tag)
     settings = {"links": LinkMonitor(), "losses": SlowPuts(0.05), "refresh": 1e6, **how}
     return Republisher(published.extend, plant, index, parts=nothing, **settings)
 
@@ -169,7 +169,7 @@ async def test_a_round_ends_when_the_link_is_full_again() -> None:
         published.extend(samples)
         losses.sent([f"plant/{sample.tag.key}" for sample in samples], 0.05, now())
 
-    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    index = TagIndex(Keys("plant", "demo"), plant.devices(), plant.tag)
     losses.sent([f"plant/{sample.tag.key}" for sample in plant.samples.values()], 0.05, now())
     again = Republisher(publish, plant, index, LinkMonitor(), losses, 1e6, nothing)
     task = asyncio.create_task(again.run())

@@ -31,7 +31,7 @@ class Plant:
 
 
 def published(plant: Plant) -> StatusPublisher:
-    publisher = Publisher(SlowPuts(0.05), TagIndex(KEYS, ()))
+    publisher = Publisher(SlowPuts(0.05), TagIndex(KEYS, (), lambda _key: None))
     return StatusPublisher(KEYS, plant.collect, publisher, Audit(lambda _: None), 5.0)
 
 

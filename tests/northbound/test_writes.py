@@ -214,7 +214,7 @@ async def test_a_write_to_a_device_of_another_gateway_gets_no_reply_even_when_bu
 async def test_a_write_may_wait_for_a_telephone_call(dial: float) -> None:
     plant = mixer()
     plant.dial = dial
-    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    index = TagIndex(Keys("plant", "demo"), plant.devices(), plant.tag)
     writes = Writes(plant, index, lambda _: None, Acceptance(SendPermit(), None))
     arrived = asyncio.get_running_loop().time()
     await writes.write("plant/mixer/recipe/@set", b"7", Sender(arrived=arrived))

@@ -1,6 +1,9 @@
 """Numbers that are unpacked together are those that each tag decodes alone."""
 
+from array import array
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from hypothesis import given
@@ -16,6 +19,11 @@ from tests.sim.plant import make_tag
 
 ORDERS = st.sampled_from(Order)
 KINDS = st.sampled_from(sorted(STRUCT))
+FORMS: list[Callable[[list[int]], Sequence[int]]] = [
+    tuple,
+    partial(array, "H"),
+    partial(array, "I"),
+]
 SHAPES = st.sampled_from([Shaping(), Shaping(scale=0.1, offset=-3.0), Shaping(decimals=1)])
 
 
@@ -43,6 +51,7 @@ def test_a_row_of_numbers_has_the_values_of_its_tags(
     made: tuple[list[Tag], list[int]], data: st.DataObject
 ) -> None:
     tags, units = made
+    form = data.draw(st.sampled_from(FORMS))  # of the units, as drivers read them
     begins = [tag.span.start for tag in tags]
     decoder = Decoder(tags, begins)
 
@@ -51,12 +60,12 @@ def test_a_row_of_numbers_has_the_values_of_its_tags(
             tag.decode(units[at : at + tag.span.size]) for tag, at in zip(tags, begins, strict=True)
         ]
 
-    scan = decoder.first(units, 1)
+    scan = decoder.first(form(units), 1)
     assert [sample.value for sample in scan] == alone(units)
     place = data.draw(st.integers(0, len(units) - 1))
     later = [*units]
     later[place] ^= data.draw(st.integers(1, 0xFFFF))
-    after = decoder.after(scan, later, 2)
+    after = decoder.after(scan, form(later), 2)
     assert [sample.value for sample in after] == alone(later)
 
 

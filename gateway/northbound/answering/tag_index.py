@@ -1,6 +1,6 @@
 """The tags and devices that a key expression selects."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import zenoh
@@ -18,15 +18,19 @@ class _Entry(NamedTuple):
 
 
 class TagIndex:
-    """A dict for concrete keys, and one entry per device for wildcards. Read by many threads."""
+    """The plant's table for concrete keys, and one entry per device for wildcards. Read by many
+    threads."""
 
-    def __init__(self, keys: Keys, devices: Iterable[Device]) -> None:
+    def __init__(
+        self, keys: Keys, devices: Iterable[Device], find: Callable[[str], Tag | None]
+    ) -> None:
+        """`find`: returns the tag of `device/name`."""
         self.keys = keys
+        self._find = find
         self._entries = [
             _Entry(device, zenoh.KeyExpr(f"{keys.device(device.name)}/**")) for device in devices
         ]
         self.tags: Sequence[Tag] = [tag for entry in self._entries for tag in entry.device.tags]
-        self._by_key = {tag.key: tag for tag in self.tags}
         modes = {entry.device.name: entry.device.blocks for entry in self._entries}
         self.names = frozenset(modes)
         self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
@@ -40,7 +44,7 @@ class TagIndex:
 
     def tag_at(self, value_key: str) -> Tag | None:
         key = self.keys.tag(value_key)
-        return None if key is None else self._by_key.get(key)
+        return None if key is None else self._find(key)
 
     def is_device(self, key: str) -> bool:
         """True for the key of one of our devices: no tag, no wildcard."""

@@ -1,5 +1,7 @@
 """Modbus PDUs (application protocol V1.1b3, 6): requests by pymodbus, replies by `struct`."""
 
+import sys
+from array import array
 from collections.abc import Callable, Sequence
 from itertools import chain
 from struct import Struct
@@ -85,14 +87,20 @@ def bits_in(count: int) -> Callable[[bytes], Sequence[int]]:
 
 
 def words_in(count: int) -> Callable[[bytes], Sequence[int]]:
-    """Returns a decoder of `count` words in a reply to function 03 or 04: high byte first."""
-    words = Struct(f">{count}H")
-    last, found = b"", tuple[int, ...]()
+    """Returns a decoder of `count` words in a reply to function 03 or 04: high byte first.
+
+    The words are an array, two bytes each: a tuple takes 36 bytes for each word of a block.
+    """
+    last, found = b"", array("H")
 
     def unpack(pdu: bytes) -> Sequence[int]:
         nonlocal last, found
         if pdu != last:  # an equal reply gives the same units: they are not compared one by one
-            last, found = pdu, words.unpack_from(pdu, 2)
+            last, found = pdu, array("H", pdu[2 : 2 + 2 * count])
+            if len(found) != count:
+                raise ValueError(f"{len(found)} words in a reply, not {count}")
+            if sys.byteorder == "little":
+                found.byteswap()
         return found
 
     return unpack

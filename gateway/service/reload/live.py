@@ -67,7 +67,9 @@ class LiveReload:
     async def _take_over(self, difference: Difference, file: Config) -> None:
         northbound, claiming = self._northbound, self._northbound.admission.claiming
         names = {device.name for device in file.devices}
-        index = await off_loop(TagIndex, northbound.keys, difference.config.devices)
+        index = await off_loop(
+            TagIndex, northbound.keys, difference.config.devices, self._plant.tag
+        )
         # A device is claimed before its first request, and until after its last one.
         await claiming.change(names.union(d.name for d in self._reloader.current.devices))
         await Renewal(self._plant, self._lines, difference).run()
