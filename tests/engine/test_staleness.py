@@ -1,13 +1,16 @@
 """A value that is not read for too long turns bad, though its device answers."""
 
 import asyncio
+from collections.abc import Sequence
 
 import pytest
 
-from gateway.engine.device.ages import polled_blocks, worst_ages
+from gateway.engine.device.ages import PolledBlock, polled_blocks, worst_ages
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.jobs.jobs import Poll, Resynced
+from gateway.engine.results import staleness
+from gateway.engine.results.staleness import Staleness
 from gateway.errors import NoReply
 from gateway.tags import Quality, Reason
 from tests.engine.rig import Rig, link_device
@@ -156,3 +159,27 @@ def test_an_old_value_names_the_device_that_fails_and_the_log_says_it_once(faili
     assert ["others on the line" in str(event.fields) for event in logged] == [True] * (
         0 if failing else 2
     )
+
+
+def test_ages_are_calculated_again_only_when_the_turnaround_changes_by_a_millisecond(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A measured turnaround is a little different after each comparison."""
+    found = list[float]()
+
+    def counting(blocks: Sequence[PolledBlock]) -> list[float]:
+        ages = worst_ages(blocks)
+        found.append(ages[0])
+        return ages
+
+    monkeypatch.setattr(staleness, "worst_ages", counting)
+    rig = Rig(link_device())
+    rig.bring(State.ONLINE)
+    read(rig)
+    [rule] = [one for one in rig.engine.rules.all if isinstance(one, Staleness)]
+    found.clear()
+    for expected in (0.0101, 0.0108, 0.0104, 0.0121, 0.0119):
+        rig.devices[0].turnaround.expected = expected
+        rule.tick(rig.now, rig.time)
+    assert len(found) == 3  # 11, 13 and 12 begun milliseconds
+    assert found[1] > found[0]

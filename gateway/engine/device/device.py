@@ -328,9 +328,10 @@ class Device:
             return None
         if not self.turnaround.learn(self.record) or self._planning_takes_long:
             return None
-        load, blocks = self.load, self.blocks
-        if self._most_gain() < WORTH_WHILE * load:
+        gain = self._most_gain()
+        if gain == 0.0 or gain < WORTH_WHILE * (load := self.load):
             return None
+        blocks = self.blocks
         self.plan()
         useful = self.load < (1 - WORTH_WHILE) * load
         self.turnaround.planned(self.record, useful=useful)

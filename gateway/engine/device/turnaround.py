@@ -49,6 +49,11 @@ class Turnaround:
         """The one that a plan expects."""
         return None if self.expected is None else max(self.expected, SHORTEST)
 
+    @property
+    def milliseconds(self) -> int | None:
+        """The expected one in begun milliseconds: worst ages are not calculated again for less."""
+        return None if self.expected is None else math.ceil(self.expected * 1000)
+
     def planned(self, record: Record, *, useful: bool) -> None:
         """Notes a plan with the expected one. The next waits longer if this one was not useful."""
         self._planned = self.expected

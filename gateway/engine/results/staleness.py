@@ -31,7 +31,7 @@ class Staleness(Rule):
     def __init__(self, schedule: Schedule, effects: Effects) -> None:
         self._schedule = schedule
         self._effects = effects
-        self._plan: list[tuple[Device, Sequence[PollEntry], float | None]] = []
+        self._plan: list[tuple[Device, Sequence[PollEntry], int | None]] = []
         self._ages: list[float] = []
         self._logged: dict[Device, float] = {}
 
@@ -71,9 +71,10 @@ class Staleness(Rule):
                 yield poll, stretch * age + longest_reply
 
     def _worst_ages(self) -> tuple[list[PollEntry], list[float]]:
-        """Returns the polls with their worst ages, calculated again only after a new plan."""
+        """Returns the polls with their worst ages. They are calculated again only after a new plan,
+        or when a turnaround changed by a millisecond: it is measured all the time."""
         online = [device for device in self._schedule.devices if device.health.online]
-        plan = [(d, self._schedule.polls(d), d.turnaround.expected) for d in online]
+        plan = [(d, self._schedule.polls(d), d.turnaround.milliseconds) for d in online]
         polls = [poll for _, polls, _ in plan for poll in polls]
         if plan != self._plan:
             blocks = [polled_block(poll.device, poll.block) for poll in polls]
