@@ -69,6 +69,7 @@ class StreamPort(asyncio.Protocol):
         self._is_open = False
         self._loss: LineDown | None = None
         self._transport: asyncio.Transport | None = None
+        self._now = asyncio.get_running_loop().time  # each question for the loop is a system call
         self._closed = asyncio.Event()
         self.watching: asyncio.Task[None] | None = None  # the certificate of the other side
 
@@ -139,7 +140,7 @@ class StreamPort(asyncio.Protocol):
             transport.max_size = MOST_READ
 
     def data_received(self, data: bytes) -> None:
-        rate = self._allowance.received(len(data), asyncio.get_running_loop().time())
+        rate = self._allowance.received(len(data), self._now())
         if rate:
             self.break_off(f"pours {rate:.0f} bytes/s: more than the wire can carry")
             return

@@ -429,7 +429,7 @@ class Device:
         """
         if now > begun:
             more = math.log2(now - begun) + now / HALF_LIFE
-            least, most = sorted((self.use, more))
+            least, most = (self.use, more) if self.use < more else (more, self.use)
             self.use = most + math.log2(1.0 + math.exp2(least - most))
 
 
