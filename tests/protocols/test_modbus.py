@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
+from sys import getsizeof
 from typing import Any, TypeVar
 
 import pytest
@@ -13,6 +14,7 @@ from gateway.errors import BadValue, ConfigError, DeviceError, NoReply, Refusal,
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Address, Cost, Driver, Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.protocols.modbus.pdu import words_in
 from gateway.stations.modbus import ModbusStation
 from tests.doubles import Script
 from tests.protocols.modbus_peer import KINDS, hearing
@@ -288,6 +290,18 @@ async def test_modbus_tcp_takes_the_answer_of_its_own_number_alone() -> None:
     with pytest.raises(NoReply):
         await driver.read(talk, span)
     assert list(await driver.read(talk, span)) == [3]
+
+
+def test_words_of_a_read_take_two_bytes_each_and_a_short_reply_has_none() -> None:
+    words = words_in(124)
+    reply = bytes((3, 248)) + bytes(range(248))
+    found = words(reply)
+    assert list(found) == [256 * byte + byte + 1 for byte in range(0, 248, 2)]
+    assert words(bytes(bytearray(reply))) is found  # equal: they are not compared one by one
+    assert getsizeof(found) < 400
+    for _ in range(2):
+        with pytest.raises(ValueError, match="not 124"):
+            words(reply[:-2])
 
 
 async def test_modbus_tcp_numbers_go_round() -> None:

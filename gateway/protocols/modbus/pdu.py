@@ -96,11 +96,12 @@ def words_in(count: int) -> Callable[[bytes], Sequence[int]]:
     def unpack(pdu: bytes) -> Sequence[int]:
         nonlocal last, found
         if pdu != last:  # an equal reply gives the same units: they are not compared one by one
-            last, found = pdu, array("H", pdu[2 : 2 + 2 * count])
-            if len(found) != count:
-                raise ValueError(f"{len(found)} words in a reply, not {count}")
+            words = array("H", pdu[2 : 2 + 2 * count])
+            if len(words) != count:
+                raise ValueError(f"{len(words)} words in a reply, not {count}")
             if sys.byteorder == "little":
-                found.byteswap()
+                words.byteswap()
+            last, found = pdu, words
         return found
 
     return unpack
