@@ -309,6 +309,11 @@ class Bus:
             for e in self.episodes
         )
 
+    def keeps_replies(self, device: str) -> bool:
+        """A device server keeps what the device sends, or passes it on one by one."""
+        wire = self.wire
+        return isinstance(wire, SimWire) and wire.server.keeps_replies(self.stations[device])
+
     def brought_older(self, since: float) -> bool:
         """A device server brought a station an older request of the gateway since then.
 

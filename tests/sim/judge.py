@@ -162,7 +162,7 @@ class Judge:
             return
         if bus.hurt["<"] >= since - 0.5:
             self._blind("blind reads", sample.tag)
-        elif bus.untimely(sample.tag.device):
+        elif bus.untimely(sample.tag.device) or bus.keeps_replies(sample.tag.device):
             self.story.counts["stale unsolicited frames"] += 1  # a held frame tells no time
         else:
             self.broke(f"{sample.tag.key} is told as good {sample.value!r}, which was not said")
