@@ -51,7 +51,6 @@ class Transaction:
         "_needs_resync",
         "_on_unmatched_frame",
         "_open",
-        "_replied",
         "_stray",
         "guarded",
         "has_sent",
@@ -82,7 +81,6 @@ class Transaction:
         self._answered = 0.0  # when the last reply arrived
         self._stray: Evidence | None = None  # of frames that were no reply
         self._late: LateReply | None = None
-        self._replied: tuple[Any, Callable[[Any], Any]] | None = None  # last; what it answers
         self._gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
 
     @property
@@ -300,9 +298,9 @@ class Transaction:
 
     def _contradicts(self, frame: Any) -> bool:
         """Returns True for another reply to the last request that was answered."""
-        if self._replied is None:
+        if self.traffic.replied is None:
             return False
-        replied, answers = self._replied
+        replied, answers = self.traffic.replied
         try:
             return frame != replied and answers(frame) is not None
         except DeviceError:
@@ -325,8 +323,7 @@ class Transaction:
             own = len(request.data) if request.data in self._heard else 0  # its echo
             self.traffic.strange |= beyond - own >= SHORTEST_COMMAND
         self._heard = b""
-        self._replied = self.traffic.replied = frame, request.answers
-        self.traffic.contradicted = False
+        self.traffic.replied, self.traffic.contradicted = (frame, request.answers), False
         request.future.set_result(answer)
 
     def _takes_late(self, frame: Any) -> bool:

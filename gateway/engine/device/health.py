@@ -5,9 +5,10 @@ The table `TRANSITIONS` holds every change of state. No other module assigns a f
 
 import math
 from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
+from typing import Any
 
 from gateway.engine.device.probe_pace import ProbePace
 from gateway.errors import (
@@ -100,15 +101,17 @@ class Outstanding:
 
 @dataclass(slots=True)
 class Presence:
-    """Notes that a device of a line came online, or is no longer online."""
+    """The devices of a line that are not online, as they were at the last look."""
 
+    absent: Sequence[Any] = ()
     changed: bool = True
 
     def note(self) -> None:
         self.changed = True
 
-    def seen(self) -> None:
+    def look(self, devices: Sequence[Any]) -> None:
         self.changed = False
+        self.absent = [device for device in devices if not device.health.online]
 
 
 @dataclass(slots=True, eq=False)
@@ -132,7 +135,6 @@ class Health:
     probes: ProbePace = field(default_factory=ProbePace)
     unanswered: Outstanding = field(default_factory=Outstanding)
     _asked_at: float = -math.inf  # when a request ended unclear last, before it was offline
-    _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
     # A device server may hold requests to its station that this device never sent.
     inherits: bool = False
@@ -276,18 +278,17 @@ class Health:
 
     def next_probe_token(self) -> int:
         """Returns a token for a resync. The token after it is free for a second resync request."""
-        self._probe_token += 2
-        return self._probe_token
+        return self.probes.next_token()
 
     @property
     def spare_token(self) -> int:
         """The token for a second resync request after the last token."""
-        return self._probe_token + 1
+        return self.probes.token + 1
 
     def resyncs_elsewhere(self) -> None:
         """Notes that resyncs have other spans from now on. Their replies are told apart from those
         to earlier resyncs no longer, so that the line settles after the first reply."""
-        self._probe_token = 0
+        self.probes.begin_tokens()
 
     def outstanding_requests(self, since: float) -> int:
         """Counts the requests sent after `since` that have no reply."""

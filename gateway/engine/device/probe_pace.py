@@ -20,6 +20,7 @@ class ProbePace:
     due: float = 0.0
     short: int = 0  # short probes since the last patient one, or the last reply
     patient: bool = False  # the next probe waits for the whole `reply_timeout`: it replies late
+    token: int = 0  # of the last resync
     _behind_until: float = -math.inf  # until then a server has older requests to pass on
     _last: float = -math.inf  # of an offline device
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
@@ -29,6 +30,13 @@ class ProbePace:
 
     def restart(self) -> None:
         self.short = 0
+
+    def begin_tokens(self) -> None:
+        self.token = 0
+
+    def next_token(self) -> int:
+        self.token += 2
+        return self.token
 
     def replied(self) -> None:
         self.short, self.pause = 0, 0.0

@@ -96,7 +96,6 @@ class ReplyShapes:
         "at",
         "collided",
         "extra_at",
-        "last",
         "longer",
         "mark_due",
         "proofs",
@@ -108,7 +107,6 @@ class ReplyShapes:
 
     def __init__(self, longer: LongerReads) -> None:
         self.longer = longer
-        self.last: Hashable = None  # shape of the reply to the last request
         self._used: dict[Hashable, float] = {}  # when a read with each shape was sent last
         self._recent: deque[Hashable] = deque(maxlen=MOST_CHOICES - 1)  # of the last requests
         self.span: Span | None = None  # of the last read
@@ -152,7 +150,7 @@ class ReplyShapes:
         self._recent.append(shape)
         if self.quiet == WARY:
             self.proofs.twins.asked()
-        self.last, self.span = shape, read
+        self.span = read
         return read
 
     def collides(self, block: Block, now: float) -> bool:
@@ -207,7 +205,6 @@ class ReplyShapes:
             self.proofs.twins.asked()
         if now - self.at >= self.quiet:
             self._prove(now)
-        self.last = shape
 
     def written(
         self, span: Span, units: Sequence[int], reads: bool, now: float
@@ -279,6 +276,11 @@ class ReplyShapes:
     def doubt(self, now: float) -> None:
         """Notes an extra reply of any device of the line: from now on each read needs a proof."""
         self.wary_at, self.quiet = now, WARY
+
+    @property
+    def last(self) -> Hashable:
+        """The shape of the reply to the last request."""
+        return self._recent[-1] if self._recent else None
 
     @property
     def is_wary(self) -> bool:

@@ -59,7 +59,6 @@ class Schedule:
         self._polls: dict[Device, list[PollEntry]] = {}
         self._readers: dict[Device, dict[Tag, PollEntry]] = {}  # made at the first call of `reader`
         self._presence = Presence()
-        self._absent: Sequence[Device] = ()  # devices that are not online
         self._wrote = False
         self._expedited = False
         self._on_demand_lane = now  # until then no poll on demand delays another
@@ -221,10 +220,9 @@ class Schedule:
                 return job
         self._wrote = False
         if self._presence.changed:
-            self._presence.seen()
-            self._absent = [device for device in self.devices if not device.health.online]
-        if self._absent:
-            probe = self._probes.next(self._absent, now, now if due else until)
+            self._presence.look(self.devices)
+        if absent := self._presence.absent:
+            probe = self._probes.next(absent, now, now if due else until)
             if isinstance(probe, Probe):
                 return probe
             until = min(until, probe)
