@@ -94,7 +94,6 @@ class ReplyShapes:
         "_unclear_until",
         "_used",
         "at",
-        "collided",
         "extra_at",
         "longer",
         "mark_due",
@@ -111,7 +110,6 @@ class ReplyShapes:
         self._recent: deque[Hashable] = deque(maxlen=MOST_CHOICES - 1)  # of the last requests
         self.span: Span | None = None  # of the last read
         self.at = -NEVER  # when the last transaction ended
-        self.collided = False  # an earlier reply has the shape of the last poll, and may come again
         self.quiet = QUIET
         self.proven = 0.0  # values read before are no extra replies
         self.mark_due = 0.0  # when a resync must show the order, if the wire is not quiet before
@@ -132,7 +130,6 @@ class ReplyShapes:
         choices = self.longer.by_span.get(span) or self.longer.choices(span)
         used = self._used
         shape, read = choices[0][1], span  # the caller tells the block's own span by identity
-        self.collided = False
         if now - self.at >= self.quiet:
             self._prove(now)
         elif self.is_recent(shape, now):
@@ -145,7 +142,6 @@ class ReplyShapes:
                     at = used.get(choice[1], -NEVER)
                     if at < longest_ago:
                         longest_ago, (read, shape) = at, choice
-            self.collided = now - longest_ago < self.quiet
         used[shape] = now
         self._recent.append(shape)
         if self.quiet == WARY:

@@ -115,11 +115,11 @@ class Proofs:
 def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
     """Returns True if the reply may be another one, and no own reply may follow it.
 
-    The station had no reply to this read last time. Or it cannot reply so soon, on a doubtful line.
-    Or it replies much sooner otherwise, and an earlier reply with this shape may arrive once more.
+    The station had no reply to this read last time. Or, on a doubtful line, it cannot reply so
+    soon, or it replies much sooner otherwise: it may have missed the read, and a copy, or the reply
+    to another master, took the place.
     """
     if poll.missed or (traffic.doubtful and poll.device.is_doubtful):
         return True
-    shapes, late = poll.device.shapes, poll.device.late_from
-    collided = shapes is not None and shapes.collided
-    return collided and late is not None and traffic.turnaround > late
+    late = poll.device.late_from
+    return poll.device.is_doubtful and late is not None and traffic.turnaround > late
