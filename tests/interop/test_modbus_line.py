@@ -111,7 +111,7 @@ def device_of(driver: Any, wire: WireTiming) -> Device:
     texts += [f"{area}:{n}" for area in ("coil", "discrete") for n in range(20)]
     write = WriteRule(verify=True)
     tags = [make_tag(t, driver, type=_type(t), every=0.05, write=write) for t in texts]
-    timing = replace(driver.timing, reply_timeout=1.0)
+    timing = replace(driver.timing, reply_timeout=10.0)
     return made_device("peer", driver, wire, timing, tuple(tags), 1.0)
 
 
