@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any, TypeVar, cast
 
 from gateway.engine.device.device import Device
+from gateway.engine.device.twins import answers_again
 from gateway.engine.jobs.jobs import Settled, Traffic
 from gateway.errors import Busy, DeviceError, Evidence, Garbled, LineDown
 from gateway.line.channel import NEVER, SHORTEST_REPLY, Channel
@@ -148,9 +149,10 @@ class Transaction:
         self._answered = answered = channel.quiet_since
         traffic = self.traffic
         traffic.exchanges += 1
-        own = answered - alone - busy
-        too_soon = own < device.record.replies.soonest and device.shapes is not None
-        too_soon = too_soon and device.record.replies.is_too_soon(own, busy)
+        own, replies = answered - alone - busy, device.record.replies
+        too_soon = (
+            own < replies.soonest and device.shapes is not None and replies.is_too_soon(own, busy)
+        )
         if too_soon or request.equal:
             unproven = started - channel.echo.absent_at
             traffic.doubtful |= too_soon or device.may_be_echo(own, unproven)
@@ -284,10 +286,11 @@ class Transaction:
         foreign = not old and getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
-        self.traffic.strange |= not is_echo and self._may_be_reply(frame)
-        if not is_echo and not foreign and not old and self._may_be_reply(frame):
-            self.traffic.extra += 1
-            self.traffic.contradicted |= self._contradicts(frame)
+        if not is_echo and self._may_be_reply(frame):
+            self.traffic.strange = True
+            if not foreign and not old:
+                self.traffic.extra += 1
+                self.traffic.contradicted |= self._contradicts(frame)
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
 
@@ -298,13 +301,8 @@ class Transaction:
 
     def _contradicts(self, frame: Any) -> bool:
         """Returns True for another reply to the last request that was answered."""
-        if self.traffic.replied is None:
-            return False
-        replied, answers = self.traffic.replied
-        try:
-            return frame != replied and answers(frame) is not None
-        except DeviceError:
-            return True
+        replied = self.traffic.replied
+        return replied is not None and frame != replied[0] and answers_again(frame, replied)
 
     def _answer(self, request: _Request, frame: Any, answer: Any) -> None:
         """Ends a request that was answered, and learns of an echo."""

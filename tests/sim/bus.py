@@ -179,9 +179,7 @@ class Bus:
         )
         if device is None or self.excused(self.now() - self.began - 30.0):
             return
-        if isinstance(self.wire, SimWire) and any(
-            map(self.wire.server.keeps_replies, self.stations.values())
-        ):
+        if any(map(self.keeps_replies, self.stations)):
             return  # a frame that was held may end the request of another station
         if device.state in (State.OFFLINE, State.STARTING):
             return  # the line does not wait for late replies to a probe

@@ -182,8 +182,7 @@ class Judge:
         well = bus.line.engine.is_open and bus.line.engine.record.since < start - 2.0
         troubled = any(e.start < passed + 2.0 and e.end > passed - 5.0 for e in bus.episodes)
         if isinstance(bus.wire, SimWire):
-            server, late = bus.wire.server, bus.wire.behind > start - 5.0
-            troubled = troubled or late or server.keeps_replies(self.stations[name])
+            troubled = troubled or bus.wire.behind > start - 5.0 or bus.keeps_replies(name)
         if well and not troubled and not bus.collides:
             limit = end - start + station.wrapping.gap + 0.1
             asyncio.get_running_loop().call_later(limit, self._must_be_told, name, start, value)

@@ -195,7 +195,7 @@ class Replies:
     quickest: float = math.inf  # of many recent exchanges
     soonest: float = -math.inf  # a reply that comes sooner may be another one
     # Replies come before their characters can be over, by this share of their time; <= 0
-    ahead: float = 0.0
+    _ahead: float = 0.0
     _quickest_now: float = math.inf  # of those that are counted at present
     _ahead_now: float = 0.0
     _early: int = 0
@@ -208,8 +208,8 @@ class Replies:
         if ahead < -FASTER:
             self._early += 1
             self._ahead_now = min(self._ahead_now, ahead)
-            if self.ahead:
-                self.ahead = min(self.ahead, ahead)
+            if self._ahead:
+                self._ahead = min(self._ahead, ahead)
         elif own < self._quickest_now:
             self._quickest_now = own
             self.soonest = min(self.soonest, _soonest(own))
@@ -219,8 +219,8 @@ class Replies:
 
     def _begin_again(self) -> None:
         # A few that came early are others. If most do, the wire is faster than the file says.
-        self.ahead = self._ahead_now if 2 * self._early > self._counted else 0.0
-        self.quickest = 0.0 if self.ahead else self._quickest_now
+        self._ahead = self._ahead_now if 2 * self._early > self._counted else 0.0
+        self.quickest = 0.0 if self._ahead else self._quickest_now
         self.soonest = _soonest(self.quickest)
         self._quickest_now, self._ahead_now, self._early, self._counted = math.inf, 0.0, 0, 0
 
@@ -231,7 +231,7 @@ class Replies:
         """
         if self.soonest > 0.0:
             return own < self.soonest
-        return own < min(self.soonest, (self.ahead - FASTER) * busy)
+        return own < min(self.soonest, (self._ahead - FASTER) * busy)
 
 
 def _soonest(quickest: float) -> float:

@@ -11,6 +11,14 @@ KEPT = 16  # requests
 FOR = 600.0  # seconds
 
 
+def answers_again(frame: Any, replied: Replied) -> bool:
+    """Returns True if the frame answers the request of this reply, too; an error reply may."""
+    try:
+        return replied[1](frame) is not None
+    except DeviceError:
+        return True
+
+
 class Twins:
     """Learns of a second station from replies that answer the last request once more.
 
@@ -38,14 +46,9 @@ class Twins:
         """Takes a frame that answers no open request."""
         if self._last is None or not self._again:
             return
-        reply, answers = self._last
-        try:
-            again = answers(frame) is not None
-        except DeviceError:
-            again = True
-        if again:
+        if answers_again(frame, self._last):
             self._again[-1] = True
-            if frame != reply:
+            if frame != self._last[0]:
                 self._differed = now
 
     def exist(self, now: float) -> bool:

@@ -67,7 +67,7 @@ class Stray(Rule):
                 device.record.count_stray(len(own))
                 self._log_frames(device, own, now)
                 self._count_older(device, own, now)
-                extra = bool([frame for frame in own if _is_extra_reply(device, frame, now)])
+                extra = _note_extra_replies(device, own, now)
                 if extra or (own and device.driver.traits.over_network):
                     self._replied()
                 if extra:
@@ -82,7 +82,7 @@ class Stray(Rule):
             if each.driver.traits.over_network and each.driver.station == frame.station:
                 self._count_older(each, [frame], now)
         for each in self._devices:
-            if not echo and _is_extra_reply(each, frame, now):
+            if not echo and _note_extra_replies(each, [frame], now):
                 self._results.spoke(each, now)
                 self._results.answered_twice(each, now, time)
 
@@ -130,13 +130,15 @@ def _readers(devices: Sequence[Device]) -> dict[object, list[Device]]:
     return readers
 
 
-def _is_extra_reply(device: Device, frame: Any, now: float) -> bool:
-    """Returns True for a reply of the device, where replies have no number, and notes it."""
+def _note_extra_replies(device: Device, frames: Sequence[Any], now: float) -> bool:
+    """Notes the replies of the device, where replies have no number. Returns True if one is."""
     shapes = device.shapes
-    if shapes is None or not cast("UnnumberedReplies", device.driver).is_reply(frame):
+    if shapes is None:
         return False
-    shapes.proofs.twins.arrived(frame, now)
-    return True
+    replies = [f for f in frames if cast("UnnumberedReplies", device.driver).is_reply(f)]
+    for frame in replies:
+        shapes.proofs.twins.arrived(frame, now)
+    return bool(replies)
 
 
 def _kind(codec: Codec[Any]) -> object:
