@@ -156,9 +156,12 @@ async def _line_lost(line: Plant) -> None:
 async def _other_computer(line: Plant) -> None:
     """Another computer on the wire registers a list of the same length; the line receives it."""
     _other_list(line)
+    line.bench.received(_registration())
+
+
+def _registration() -> bytes:
     cells = "".join(f"D{3900 + n:04d}" for n in range(len(SCATTERED)))
-    other = Enquiry(5, "WM", f"{len(SCATTERED):02X}{cells}")
-    line.bench.received(LinkCodec().encode(other))
+    return LinkCodec().encode(Enquiry(5, "WM", f"{len(SCATTERED):02X}{cells}"))
 
 
 def _other_list(line: Plant) -> None:
@@ -229,6 +232,37 @@ async def test_a_registration_without_an_acknowledgement_is_repeated() -> None:
         await asyncio.sleep(20)
         assert line.good(dev)
         assert commands(station).count("WM") == 3
+        assert 7777 not in {sample.value for _, sample in line.reported}
+
+
+@pytest.mark.parametrize(("acknowledged", "registered"), [(b"", 2), (b"\x0605FF", 1)])
+@on_virtual_time
+async def test_a_list_that_is_changed_while_another_station_is_read_is_not_read(
+    acknowledged: bytes, registered: int
+) -> None:
+    """An acknowledgement that nobody asked for ends lists for ten minutes."""
+    dev = link_device(ComputerLink(station=5, monitor=True), *SCATTERED, every=0.5)
+    line = link_plant([dev, link_device(ComputerLink(station=6), "D0", every=0.5)])
+    first, second = line.stations
+    clockwork(first.memory, [int(text[1:]) for text in SCATTERED])
+    first.memory.write("D", 3900, [7777] * len(SCATTERED))
+    strange: list[bytes] = []
+
+    def answer(data: bytes, now: float) -> list[bytes]:
+        replies = second.inner.hear(data, now)
+        if replies and strange:
+            _other_list(line)
+            return [strange.pop(), *replies]
+        return replies
+
+    second.answer = answer
+    async with running(line):
+        await asyncio.sleep(5)
+        strange.append(_registration() + acknowledged)
+        await asyncio.sleep(5)
+        assert strange == []
+        assert line.good(dev)
+        assert commands(first).count("WM") == registered
         assert 7777 not in {sample.value for _, sample in line.reported}
 
 
