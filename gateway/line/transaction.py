@@ -217,6 +217,8 @@ class Transaction:
 
     def _expect_gap(self, codec: EndedByGap[Any]) -> None:
         """Sets the timer for a silence that ends the frame."""
+        if codec.pending and all(request.future.done() for request in self._open):
+            self.traffic.strange = True  # another frame begins behind the reply
         if gap := codec.gap_timeout:
             self._gap = self._channel.loop.call_later(gap, self._take, codec.expire)
 

@@ -136,6 +136,10 @@ class EndedByGap(Protocol[F]):
     def gap_timeout(self) -> float | None:
         """None: no silence ends a frame."""
 
+    @property
+    def pending(self) -> int:
+        """The number of bytes kept: part of a frame."""
+
     def expire(self) -> list[F]:
         """Returns the frames that the silence has ended. Raises as `feed`."""
 

@@ -62,13 +62,19 @@ class UnsolicitedListener(Protocol):
         """Returns True if a transaction of this driver finds the frames of the device too."""
 
     def unmatched(self, frame: Any, now: float) -> Collection[UnsolicitedEvent]:
-        """Decodes a whole frame that arrived during a transaction and is not its reply."""
+        """Decodes a frame that arrived during a transaction and is not its reply.
+
+        Its first characters may have been lost while the gateway sent.
+        """
 
     def tick(self, now: float) -> Collection[UnsolicitedEvent]:
         """Ends frames by silence, and marks fields as stale."""
 
-    def restart(self, now: float) -> None:
-        """Discards an incomplete frame, because other frames were on the line."""
+    def restart(self, now: float, *, whole: bool) -> None:
+        """Discards an incomplete frame, because other frames were on the line.
+
+        `whole`: the last was a whole reply with the same framing, and nothing followed it.
+        """
 
 
 @runtime_checkable

@@ -10,6 +10,7 @@ from gateway.engine.device.health import State
 from gateway.engine.device.reply_shapes import QUIET, SHOWN, UNPROVEN, WARY_FOR
 from gateway.engine.forecast import forecast
 from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
+from gateway.engine.jobs.poll_entry import OWED
 from gateway.errors import Refusal, Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import Ack
@@ -239,11 +240,30 @@ def test_after_a_read_without_a_reply_the_next_reply_proves_nothing() -> None:
     """The station may be silent about that register, and the reply that of another master."""
     rig = doubtful(link_device(retries=0))
     [poll] = rig.engine.schedule.polls(rig.device)
-    poll.missed = 1
-    late_read(rig, 0.005)
-    assert not good(rig)
+    poll.ended(rig.now, False, None)
+    poll.came_online(rig.now)  # other registers are read: the device was offline for a moment
+    for _ in range(OWED):
+        late_read(rig, 0.005)
+        assert not good(rig)
     late_read(rig, 0.005)
     assert good(rig)
+    poll.ended(rig.now, False, None)
+    late_read(rig, 0.005)
+    poll.ended(rig.now, False, None)  # silent again: it begins again
+    for _ in range(OWED):
+        late_read(rig, 0.005)
+        assert not good(rig)
+
+
+def test_another_plan_remembers_about_which_registers_the_station_was_silent() -> None:
+    rig = doubtful(link_device(retries=0))
+    [poll] = rig.engine.schedule.polls(rig.device)
+    poll.ended(rig.now, False, None)
+    rig.engine.schedule.replace(poll, [poll.block], rig.now)
+    rig.engine.schedule.plan(rig.device, rig.now)
+    [again] = rig.engine.schedule.polls(rig.device)
+    assert again is not poll
+    assert again.reads.owed == OWED
 
 
 @pytest.mark.parametrize("job", [Probe, Settle])

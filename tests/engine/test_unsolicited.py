@@ -608,6 +608,71 @@ async def test_an_unsolicited_frame_during_a_poll_of_another_device_is_not_lost(
         assert bench.values("weight") == [12] * (asked - 2)
 
 
+PLAIN = """
+lines:
+  hall:
+    port: /dev/ttyS1
+    devices:
+      scale:
+        protocol: frames
+        framing: {terminator: "<CR><LF>"}
+        listen: {key: {match: '[+]?(?P<key>[0-9]{1,6})', fields: {key: {type: integer}}}}
+        ask:
+          weight: {send: W, match: 'W(?P<w>[0-9]{1,5})', fields: {w: {type: integer}}}
+        tags:
+          key:    {address: key}
+          weight: {address: w, every: 40ms}
+"""
+
+
+@on_virtual_time
+async def test_the_end_of_a_frame_whose_head_a_request_covered_is_no_value(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(PLAIN)
+    async with running(load(path), replies=lambda _: b"45\r\nW12\r\n") as bench:
+        await asyncio.sleep(3)
+        assert set(bench.values("weight")) == {12}
+        assert bench.values("key") == []
+
+
+@on_virtual_time
+async def test_frames_without_a_header_are_heard_between_polls_of_a_busy_line(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(PLAIN)
+    async with running(load(path), replies=lambda _: b"W12\r\n") as bench:
+        await asyncio.sleep(1)
+        said = 0
+        for _ in range(200):
+            await asyncio.sleep(0.0501)
+            if now() - bench.sent[-1][0] < 2 * bench.pause:
+                continue
+            said += 1
+            bench.say(b"+000123\r\n")
+        assert said > 80
+        assert bench.values("key") == [123] * said
+
+
+@on_virtual_time
+async def test_a_frame_that_begins_with_the_end_of_a_reply_waits_for_a_silence(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(PLAIN)
+    async with running(load(path), replies=lambda _: b"W12\r\n+0001") as bench:
+        await asyncio.sleep(1)
+        finished = 0
+        for _ in range(200):
+            await asyncio.sleep(0.0101)
+            if len(bench.sent) > finished and bench.pause < now() - bench.sent[-1][0] < 0.03:
+                finished = len(bench.sent)
+                bench.say(b"23\r\n")
+        assert finished > 40
+        assert set(bench.values("weight")) == {12}
+        assert bench.values("key") == []
+
+
 SHARED = """
 lines:
   hall:

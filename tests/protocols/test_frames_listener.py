@@ -182,8 +182,24 @@ def test_half_a_frame_is_void_after_a_long_pause_even_without_a_gap() -> None:
 def test_after_others_spoke_only_a_frame_that_began_afterwards_is_taken() -> None:
     listener = quiet(device("scale"))
     listener.received(STABLE[:5], now=1.0)
-    listener.restart(now=1.1)
+    listener.restart(now=1.1, whole=False)
     assert weights(listener.received(STABLE[5:] + STABLE, now=1.11)) == [1234.5]
+
+
+def test_after_a_whole_reply_a_frame_needs_no_silence() -> None:
+    listener = quiet(device("scale"))
+    listener.restart(now=1.1, whole=True)
+    assert weights(listener.received(STABLE, now=1.11)) == [1234.5]
+
+
+def test_after_a_reply_that_ended_by_its_count_a_terminator_may_follow() -> None:
+    frames = Frames(
+        framing=Framing(terminator="<CR>", max_length=2, ends=("terminator", "count")),
+        listen={"any": Listen(match="(?P<text>.+)", fields={"text": Field(type="text")})},
+    )
+    listener = quiet(frames)
+    listener.restart(now=1.1, whole=True)
+    assert listener.received(b"\rAB\r", now=1.11) == [UnsolicitedFrame("any", {"text": "AB"})]
 
 
 def test_the_k120s_weighing_machine_gets_its_answer() -> None:

@@ -31,7 +31,7 @@ class DeviceServer:
         self._behind = -math.inf
         self._unread: list[bytes] = []  # replies that arrived while no connection was open
         # By station that is held up: its replies, or the requests to it and who asked.
-        self._replies: dict[Speaker, list[Sending]] = {}
+        self._replies: dict[Speaker, list[bytes]] = {}
         self._requests: dict[Speaker, list[tuple[bytes, bytes]]] = {}
         self._rest = REST
 
@@ -145,7 +145,7 @@ class DeviceServer:
         held = None if sending.station is None else self._replies.get(sending.station)
         if held is None:
             return False
-        held.append(sending)
+        held.append(sending.data)
         return True
 
     def keeps_from(self, station: "Speaker", data: bytes, request: bytes) -> bool:
@@ -169,7 +169,7 @@ class DeviceServer:
         if not held:
             self._replies.pop(station, None)
             return
-        data = held.pop(0).data
+        data = held.pop(0)
         at = _now() + len(data) * self._wire.wire.character
         self._wire.at(at, partial(self.pass_on, data))
         self._wire.at(at + self._rest, partial(self._pass_held, station))
@@ -192,8 +192,15 @@ class DeviceServer:
         ends = now + len(data) * character
         if said[0]:
             ends = now + said[1] + len(said[0]) * character
-            self._wire.at(ends, partial(self.pass_on, said[0]))
+            self._wire.at(ends, partial(self._pass_late, station, said[0]))
         self._wire.at(ends + self._rest, partial(self._ask_held, station))
+
+    def _pass_late(self, station: "Speaker", reply: bytes) -> None:
+        """Passes on the reply to a kept request; its replies may be held up again meanwhile."""
+        if station in self._replies:
+            self._replies[station].append(reply)
+        else:
+            self.pass_on(reply)
 
 
 def _now() -> float:

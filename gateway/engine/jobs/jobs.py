@@ -204,7 +204,7 @@ class Traffic:
     ahead: float = 0.0  # of a reply before its characters could be over, to these; <= 0
     extra: int = 0  # frames of the station that answered no request
     contradicted: bool = False  # one of them could be the reply to the last request, too
-    strange: bool = False  # characters arrived that were no part of a reply: another computer?
+    strange: bool = False  # characters arrived that were no part of a reply
     silence: float = math.inf  # seconds before its request, the shortest of several
     replied: Replied | None = None  # the last
     doubtful: bool = False  # a reply may be another one, or the echo of its request

@@ -15,6 +15,7 @@ from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
 MEAN_OF = 10  # gaps between two reads
+OWED = 3  # replies in a row to a read that had none, before one counts
 SLOT = 0.05  # seconds: polls of one slot begin together, so that the program wakes less often
 
 
@@ -24,6 +25,7 @@ class BlockReads:
 
     at: float | None = None  # the last one; None: the block's values are bad
     ever: bool = False  # the block was read at least once
+    owed: int = 0  # replies before one is a value where others may come: the station was silent
     scan: Scan | None = None  # the next read is compared with it; None: with nothing
     count: int = 0  # good ones since it was planned
     overruns: int = 0  # rounds that were skipped because the one before was late
@@ -41,7 +43,7 @@ class BlockReads:
                 known = MEAN_OF
             self.mean_gap += (gap - self.mean_gap) / known
         self.count += 1
-        self.at, self.ever = now, True
+        self.at, self.ever, self.owed = now, True, 0
         if block.of_fields:
             return block.decoder.fields(units, time)
         scan = self.scan
@@ -52,6 +54,18 @@ class BlockReads:
         else:
             scan = self.scan = block.decoder.after(scan, units, time)
         return scan
+
+    def of_part(self) -> "BlockReads":
+        """Returns those of a new block with a part of these tags."""
+        return BlockReads(self.at, self.ever, self.owed)
+
+    def was_silent(self) -> None:
+        """Notes that the station did not reply to a read."""
+        self.owed = OWED
+
+    def replied(self) -> None:
+        """Notes a reply that came alone. It may be another one."""
+        self.owed = max(self.owed - 1, 0)
 
     def forget(self, now: float) -> float:
         """Forgets the last read, because its values turn bad. Returns their age."""
@@ -198,6 +212,7 @@ class PollEntry:
             every = self.every if device.bad_addresses.bad else block.every
         else:
             self.missed += 1
+            self.reads.was_silent()
             every = self.every
         asked, self.tries = self.asked, 0
         if asked - self.due >= every:

@@ -41,6 +41,8 @@ class Proofs:
             self._results.answered_twice(device, now, read.time)
         if _may_be_alone(read.poll, traffic):
             self._in_flight.doubt()
+        if not traffic.extra:
+            read.poll.reads.replied()
         self._go_on(device, [read], now)
 
     def refused(self, device: Device, now: float) -> None:
@@ -115,11 +117,11 @@ class Proofs:
 def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
     """Returns True if the reply may be another one, and no own reply may follow it.
 
-    The station had no reply to this read last time. Or, on a doubtful line, it cannot reply so
-    soon, or it replies much sooner otherwise: it may have missed the read, and a copy, or the reply
-    to another master, took the place.
+    The station was silent about this read shortly before. Or, on a doubtful line, it cannot reply
+    so soon, or it replies much sooner otherwise: it may have missed the read, and a copy, or the
+    reply to another master, took the place.
     """
-    if poll.missed or (traffic.doubtful and poll.device.is_doubtful):
+    if poll.reads.owed or (traffic.doubtful and poll.device.is_doubtful):
         return True
     late = poll.device.late_from
     return poll.device.is_doubtful and late is not None and traffic.turnaround > late

@@ -120,9 +120,12 @@ class UnsolicitedFrames(Rule):
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         """Drops incomplete frames that began before the transaction."""
+        replied = traffic.exchanges and not isinstance(result, Exception)
+        whole = bool(replied) and not (traffic.strange or traffic.extra)
         for sender in self.speakers:
             if traffic.heard or (traffic.sent and sender.device is not job.device):
-                sender.listener.restart(now)
+                alike = sender.listener.framed_as(job.device.driver)
+                sender.listener.restart(now, whole=whole and alike)
 
     @property
     def due(self) -> float:

@@ -77,14 +77,16 @@ class Schedule:
         device.health.report(self._presence)
         before = self._polls.get(device, ())
         old = {poll.block.span: poll for poll in before}
-        by_tag = [(renewed.get(tag, tag), poll) for poll in before for tag in poll.block.tags]
-        read = {tag: poll.reads.at for tag, poll in by_tag}
-        seen = {tag for tag, poll in by_tag if poll.reads.ever}
+        by_tag = [(renewed.get(tag, tag), poll.reads) for poll in before for tag in poll.block.tags]
+        read = {tag: reads.at for tag, reads in by_tag}
+        seen = {tag for tag, reads in by_tag if reads.ever}
+        owed = {tag: reads.owed for tag, reads in by_tag if reads.owed}
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
             ages = (at for tag in block.tags if (at := read.get(tag)) is not None)
-            reads = BlockReads(min(ages, default=None), not seen.isdisjoint(block.tags))
+            owes = max((owed.get(tag, 0) for tag in block.tags), default=0) if owed else 0
+            reads = BlockReads(min(ages, default=None), not seen.isdisjoint(block.tags), owes)
             if known is None or known.ticket <= EXPEDITED:
                 poll = PollEntry(device, block, now, reads=reads)
             else:
@@ -120,8 +122,8 @@ class Schedule:
         if not poll.live:
             return
         poll.retire()
-        device, at, ever = poll.device, poll.reads.at, poll.reads.ever
-        new = [PollEntry(device, block, now, reads=BlockReads(at, ever)) for block in blocks]
+        device, reads = poll.device, poll.reads
+        new = [PollEntry(device, block, now, reads=reads.of_part()) for block in blocks]
         kept = [other for other in self._polls[poll.device] if other is not poll]
         self._set_polls(poll.device, kept + new, new, now)
 

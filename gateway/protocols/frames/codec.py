@@ -254,6 +254,11 @@ class FrameCodec:
         self._damage: Garbled | None = None
 
     @property
+    def pending(self) -> int:
+        """The number of bytes kept: part of a frame."""
+        return self._reader.pending
+
+    @property
     def gap_timeout(self) -> float | None:
         """Seconds without a byte until the call of `expire`; None: never."""
         return self._reader.gap_timeout

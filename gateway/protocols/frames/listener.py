@@ -2,6 +2,7 @@
 
 from gateway.errors import Evidence, Garbled
 from gateway.protocols.frames.device import Frames
+from gateway.protocols.frames.presets import written_out
 from gateway.protocols.unsolicited import Stale, UnsolicitedEvent
 
 _QUIET = 0.05  # s; a byte after it begins a frame, where no header marks the begin
@@ -24,6 +25,7 @@ class Listener:
         """`now`: the port was opened, possibly in the middle of a frame."""
         self._device = device
         self._reader = device.reader(quiet=False)
+        self._has_header = self._reader.aligned
         self._last_byte = now
         self._late = 0  # late ticks since the last byte or silence
         self._stale_at: dict[str, float] = {}
@@ -88,13 +90,24 @@ class Listener:
         return isinstance(other, Frames) and other.framing == self._device.framing
 
     def unmatched(self, frame: bytes, now: float) -> list[UnsolicitedEvent]:
-        """Decodes a whole frame of a transaction that is not its reply; ignores an unknown one."""
+        """Decodes a frame of a transaction that is not its reply; ignores an unknown one.
+
+        On two wires the request may have covered its first characters: only a header shows that
+        it is whole.
+        """
+        if not self._has_header:
+            return []
         event = self._decoded(frame, now)
         return [] if isinstance(event, Garbled) else [event]
 
-    def restart(self, now: float) -> None:
-        """Discards an incomplete frame, because other frames were on the line."""
-        self._reader = self._device.reader(quiet=False)
+    def restart(self, now: float, *, whole: bool) -> None:
+        """Discards an incomplete frame, because other frames were on the line.
+
+        After a whole reply the next byte begins a frame; a silence need not show it. After one
+        that ended by its count a terminator may follow.
+        """
+        begins = whole and not written_out(self._device.framing).ends_by_count
+        self._reader = self._device.reader(quiet=begins)
         self._last_byte = now
 
     def _silence(self, now: float) -> list[UnsolicitedEvent]:
