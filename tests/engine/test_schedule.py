@@ -1,6 +1,7 @@
 """Each sentence of the class docstring is a test; in any order of calls no poll is lost."""
 
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -185,6 +186,22 @@ def test_a_poll_that_clients_ask_for_is_not_polled_less_than_without_them() -> N
     _, *asked = schedule.polls(dev)
     sent = questions(schedule, asked, 60.0)
     assert min(sent[poll] for poll in asked) > 50
+
+
+def test_a_poll_that_clients_ask_for_does_not_wait_for_ever_behind_polls_after_writes() -> None:
+    """The line is asked for more than it carries, and a tag is written all the time."""
+    dev = online(0, 1000, 2000, every=0.01)
+    schedule = Schedule([dev], 0.0)
+    written, asked, other = schedule.polls(dev)
+    now, sent = 0.0, Counter[PollEntry]()
+    while now < 20.0:
+        schedule.expedite(written)
+        schedule.expedite(asked, on_demand=True)
+        poll = polled(schedule, now)
+        now += dev.seconds(poll.block.cost)
+        schedule.polled(poll, now)
+        sent[poll] += 1
+    assert sent[asked] > 0.8 * sent[other]
 
 
 def test_a_poll_expedited_while_it_is_in_flight_is_sent_once_more() -> None:

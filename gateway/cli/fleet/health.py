@@ -35,6 +35,11 @@ class Health(NamedTuple):
         report = _read(_REPORT, one.status("report"))
         return cls(report["faults"], report["fault"], _read(_STATUS, one.status())["devices"])
 
+    @property
+    def starting(self) -> bool:
+        """Returns True while it is not known of a device if it replies."""
+        return "starting" in self.devices.values()
+
     def worse_than(self, before: "Health") -> list[str]:
         """Returns a sentence for each device that is newly silent, and for each kind of fault that
         is new or grew."""

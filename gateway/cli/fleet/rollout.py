@@ -133,7 +133,7 @@ class Rollout:
     def _changed(self, name: str, look: float, within: float) -> Ended:
         one, step = self._client.of(name), self._steps[name]
         try:
-            before = Health.of(one)
+            before = self._before(one, look)
         except GatewayError as error:
             return Ended(name, Result.UNREACHABLE, str(error))
         began = time.monotonic()
@@ -153,6 +153,17 @@ class Rollout:
         if wrong:
             return Ended(name, Result.WORSE, f"{'; '.join(wrong)}: {back}")
         return Ended(name, Result.BACK, f"{back}: {self._why}")
+
+    def _before(self, one: Client, within: float) -> Health:
+        """Asks until no device is starting, `within` so many seconds. Raises `GatewayError`.
+
+        A device that is starting may have been up before the gateway was started.
+        """
+        until = time.monotonic() + within
+        while True:
+            before = Health.of(one)
+            if not before.starting or time.monotonic() >= until or self._stop.wait(_AGAIN):
+                return before
 
     def _loaded(
         self, one: Client, step: Step, confirm: float, until: float

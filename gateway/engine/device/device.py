@@ -388,11 +388,14 @@ class Device:
 
         They stay the same from one good read to the next, as `Driver.resync` needs it.
         """
+        return (*self.good_reads.spans, *self.good_reads.others(self.bad_addresses, self._sound))
+
+    def _sound(self) -> Sequence[Span]:
+        """Returns some configured addresses, without bad ones if there are others."""
         tags = self.polled_tags
         bad = {tag for one in self.bad_addresses.bad.values() for tag in one.tags}
         runs = runs_of([tag for tag in tags if tag not in bad] or tags)
-        some = runs[:: 1 + len(runs) // MOST_PROBED]
-        return (*self.good_reads.spans, *some)
+        return runs[:: 1 + len(runs) // MOST_PROBED]
 
     def may_be_proven(self, now: float) -> bool:
         """Returns True if a resync with the token `PROOF` has a reply that no unanswered request

@@ -7,7 +7,7 @@ addresses more. An extra reply then arrives as a stray frame.
 """
 
 from collections import deque
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.engine.device.long_writes import LongWrite
@@ -37,6 +37,7 @@ class GoodReads:
     last: Span | None = None
     widest: Span | None = None
     replanned: bool = False  # the next good read begins again: no resync is under way then
+    _sound: tuple[Sequence[Span], Sequence[Span]] = (), ()  # bad addresses, and what is not bad
 
     def take_over(self, old: "GoodReads") -> None:
         """Takes over the last block of the same station with another plan."""
@@ -50,6 +51,13 @@ class GoodReads:
         self.last = span
         if self.widest is None or self.replanned or span.size > self.widest.size:
             self.widest, self.replanned = span, False
+
+    def others(self, bad: BadAddresses, find: Callable[[], Sequence[Span]]) -> Sequence[Span]:
+        """Returns what `find` returned for these bad addresses."""
+        known, now = self._sound[0], (*bad.bad,)
+        if known != now or not self._sound[1]:
+            self._sound = now, find()
+        return self._sound[1]
 
     @property
     def spans(self) -> Iterable[Span]:

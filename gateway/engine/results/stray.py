@@ -77,6 +77,7 @@ class Stray(Rule):
     def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
         """Takes a frame that arrived in a transaction with this device and is not its reply."""
         device.record.count_stray()
+        device.monitor.forget()
         self._log_frames(device, [frame], now)
         for each in self._devices:
             if each.driver.traits.over_network and each.driver.station == frame.station:
@@ -94,11 +95,11 @@ class Stray(Rule):
 
     def _log_frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
         """Logs complete frames that are already counted."""
+        driver = device.driver
+        if not isinstance(driver, StrayFrames):
+            return
         for frame in frames:
-            device.monitor.forget()
-            if not isinstance(device.driver, StrayFrames):
-                continue
-            if text := device.driver.describe_stray(frame):
+            if text := driver.describe_stray(frame):
                 self._log(device, text, now)
 
     def _feed(self, kind: object, device: Device, data: bytes) -> list[Any]:

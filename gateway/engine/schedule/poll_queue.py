@@ -124,9 +124,16 @@ class PollQueue:
                 return later[2]
         return first
 
+    @property
+    def keeps_back_on_demand(self) -> bool:
+        """Polls on demand are behind others: new ones of these may come again and again."""
+        waiting = self.expedited
+        return len(waiting) > 1 and waiting[0].ticket != waiting[-1].ticket == ON_DEMAND
+
     def return_due(self, now: float) -> None:
-        """Makes expedited polls that are due by now due polls like others."""
-        for poll in [poll for poll in self.expedited if poll.due <= now]:
+        """Makes polls on demand that are due by now due polls like others."""
+        due = [poll for poll in self.expedited if poll.ticket == ON_DEMAND and poll.due <= now]
+        for poll in due:
             self.expedited.remove(poll)
             poll.queue(NOT_QUEUED)
             self.push(poll)

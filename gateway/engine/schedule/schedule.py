@@ -240,12 +240,16 @@ class Schedule:
         return False
 
     def _share_on_demand(self, now: float) -> None:
-        """Charges the poll on demand that has ended: others wait three times as long."""
+        """Charges the poll on demand that has ended: others wait three times as long.
+
+        Those that must wait, for that time or behind polls after writes, keep the place that they
+        have without a client.
+        """
         if now >= self._on_demand_at:
             took, self._on_demand_at = now - self._on_demand_at, NEVER
             lane = max(self._on_demand_lane, now - took)
             self._on_demand_lane = lane + took / ON_DEMAND_SHARE
-        if now < self._on_demand_lane and self._queue.expedited:
+        if now < self._on_demand_lane or self._queue.keeps_back_on_demand:
             self._queue.return_due(now)
 
     def _next_request(
