@@ -222,8 +222,9 @@ class BadAddresses:
     def rejoin(self, now: float) -> bool:
         """Drops the next split after a pause: each that is still needed costs time-outs.
 
-        If the whole block is read, the split after it follows at once. Returns True if the device
-        is to be planned again.
+        An open search may end first, for one more pause: another plan would drop it, and on a slow
+        line no search would ever end. If the whole block is read, the split after it follows at
+        once. Returns True if the device is to be planned again.
         """
         if not self.splits:
             return False
@@ -231,7 +232,9 @@ class BadAddresses:
             self._rejoin_at = now + self._rejoin_pause
         searching = self.searches or self._suspected
         fewer = not searching and len(self.splits) < self._tried_of
-        if now < self._rejoin_at and not fewer:
+        is_open = any(not root.settled() for root in self.searches)
+        wait = self._rejoin_pause if is_open else 0.0
+        if now < self._rejoin_at + wait and not fewer:
             return False
         left = [cut for cut in self.splits if self._tried is None or cut > self._tried]
         if not left or self._tried is None:  # a round begins

@@ -278,3 +278,16 @@ def test_splits_are_tried_one_by_one_and_the_next_at_once_where_one_is_not_neede
     assert not bad.rejoin(SPLIT_FIRST + 3.0)  # another split may take its place
     assert bad.rejoin(10 * SPLIT_FIRST)  # the third
     assert bad.cuts == set()
+
+
+def test_a_search_on_a_slow_line_ends_before_another_split_is_tried() -> None:
+    """Each of its reads took ten seconds. The next plan dropped it, and it never ended."""
+    found = words(*range(16))
+    bad = found.bad_addresses
+    bad.restore(KnownBad((), (("D", 8),)), found.tags)
+    found.plan()
+    assert not bad.rejoin(0.0)
+    bad.refused(found.blocks[0], 0, SILENT)
+    assert not bad.rejoin(SPLIT_FIRST)
+    assert bad.searching
+    assert bad.rejoin(2 * SPLIT_FIRST)  # but it waits for no search that does not end
