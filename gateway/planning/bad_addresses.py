@@ -152,6 +152,10 @@ class BadAddresses:
         span = block.span
         return span in self.silenced or span in self.bad or span in self._leaves
 
+    def is_trial(self, span: Span) -> bool:
+        """Returns True for a whole block that had to be split before: one refusal is enough."""
+        return any(_is_inside(cut, (span,)) for cut in self._suspected)
+
     def went_silent(self, block: Block) -> None:
         """Notes the request after which a device went offline that had just replied."""
         self.silenced.add(block.span)

@@ -148,8 +148,10 @@ class Carrier:
     def _may_be_stale(self, row: Row) -> bool:
         """The gateway may count the age from an earlier read: after a new plan from the oldest one
         of all tags that are read together now."""
-        age = self.judge.now - self.judge.read_at.get(row.source, -math.inf)
-        return age >= row.rule.stale - 2 * row.source.every  # the oldest may be late itself
+        source, read = row.source, self.judge.read_at
+        beside = (t for t in read if (t.device, t.span.area) == (source.device, source.span.area))
+        age = self.judge.now - min(map(read.__getitem__, beside), default=-math.inf)
+        return age >= row.rule.stale - 2 * source.every  # the oldest may be late itself
 
     def _judge_value(self, row: Row, value: Value, *, fresh: bool) -> None:
         judge, rule, name = self.judge, row.rule, f"transfer {row.rule.number}"
