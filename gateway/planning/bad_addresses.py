@@ -128,6 +128,7 @@ class BadAddresses:
     silenced: set[Span] = field(default_factory=set)  # one failure halves these, also for later
     clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
+    _fell: Span | None = None  # the block before a resync without a reply, and not read since
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
     _rejoin_at: float | None = None
     _rejoin_pause: float = SPLIT_FIRST
@@ -147,9 +148,8 @@ class BadAddresses:
         """Returns True while a search waits for this block."""
         return block.span in self._leaves
 
-    def is_suspect(self, block: Block) -> bool:
-        """Returns True if the device may be silent about an address of the block."""
-        span = block.span
+    def is_suspect(self, span: Span | None) -> bool:
+        """Returns True for a block with an address about which the device may be silent."""
         return span in self.silenced or span in self.bad or span in self._leaves
 
     def is_trial(self, span: Span) -> bool:
@@ -159,6 +159,17 @@ class BadAddresses:
     def went_silent(self, block: Block) -> None:
         """Notes the request after which a device went offline that had just replied."""
         self.silenced.add(block.span)
+        self.clear = False
+
+    def fell_silent(self, block: Block) -> None:
+        """Notes the block before a resync without a reply, after which the device went offline.
+
+        Once this is noise, or the device. The second time, without a read of the block between,
+        the device may be silent about an address of it.
+        """
+        if block.span == self._fell:
+            self.silenced.add(block.span)
+        self._fell = block.span
         self.clear = False
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
@@ -192,6 +203,8 @@ class BadAddresses:
         if node is not None:
             node.good = True
         self.silenced.discard(block.span)
+        if block.span == self._fell:
+            self._fell = None
         if self._suspected:  # the whole block is read: its halves were no cure
             area, start, size = block.span
             self._suspected -= {(area, n) for n in range(start + 1, start + size)}
@@ -264,7 +277,7 @@ class BadAddresses:
 
     def _look(self) -> None:
         kept = self.bad or self.searches or self.splits or self._suspected
-        self.clear = not (kept or self.silenced)
+        self.clear = not (kept or self.silenced or self._fell)
 
     def _open_splits(self) -> set[Cut]:
         open_ones = (root for root in self.searches if not root.settled())

@@ -177,7 +177,7 @@ def test_a_search_that_is_dropped_goes_on_after_one_failure_of_the_whole_block()
     (whole,), bad = found.blocks, found.bad_addresses
     bad.refused(whole, 0, SILENT)
     bad.abandon()
-    assert bad.is_suspect(whole)  # the engine halves it after one failure
+    assert bad.is_suspect(whole.span)  # the engine halves it after one failure
     bad.refused(whole, 0, SILENT)
     assert bad.known().cuts == (("D", 8),)
 
@@ -187,7 +187,7 @@ def test_a_changed_device_goes_on_with_the_searches_of_the_one_before() -> None:
     (whole,) = old.blocks
     old.bad_addresses.refused(whole, 0, SILENT)
     new.take_over(old)
-    assert new.bad_addresses.is_suspect(whole)
+    assert new.bad_addresses.is_suspect(whole.span)
     other.take_over(old)
     assert other.bad_addresses.clear  # it has no such block
 

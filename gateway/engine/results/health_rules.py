@@ -85,27 +85,29 @@ class HealthRules:
         time: int,
         *,
         short: bool = False,
-        suspect: bool = False,
+        suspect: int = 0,
     ) -> None:
         """Applies an unclear transaction after the line has settled; it took `took` seconds.
 
         `late`: seconds from the time-out to the late reply, if it arrived. `short`: it was a short
         probe. A device that starts is offline only after a patient one, unless it was before.
-        `suspect`: a poll of addresses about which the device may be silent. The device is offline
-        only if it does not reply to the next request either, also with `retries: 0`. The same is
-        true if it answered another request in this time: it may take one at a time.
+        `suspect`: failures in a row that an address may explain about which the device is silent.
+        The device is offline only if it does not reply to the next request either, also with
+        `retries: 0`. The same is true if it answered another request in this time: it may take one
+        at a time.
         """
         health = device.health
         if late is not None:
             device.record.count_late()
             timeout = device.timing.reply_timeout
-            last = self.outstanding_requests(device) <= 1
+            # A bridge may say late that one address is silent: a resync shows if the device is.
+            last = self.outstanding_requests(device) <= 1 and device.shapes is not None
             health.replied_late(timeout + late, timeout, now, last=last)
         if before is not State.OFFLINE:
             self._schedule.failed(now, took)
         unknown = before in (State.STARTING, State.OFFLINE)
         reads = (poll.reads.at for poll in self._schedule.polls(device))
-        suspect = suspect or any(at is not None and at > now - took for at in reads)
+        suspect = suspect or int(any(at is not None and at > now - took for at in reads))
         retries = max(device.timing.retries, suspect)
         if not unknown and health.consecutive_failures <= retries:
             return

@@ -235,12 +235,11 @@ class NextJob:
         took = now - self._in_flight.begun
         failed = self._in_flight.failed  # in the same transaction
         alone = len(failed) == 1
-        suspect = isinstance(after, Identify) or (
-            alone and isinstance(after, Poll) and _is_suspect(after)
-        )
+        suspect = _suspect(after, alone=alone)
         self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )
+        self._polls.fell_silent(settle)
         for poll, error in failed:
             self._polls.unread(poll, error, now, time, alone=alone)
         if not isinstance(after, Poll | Probe):
@@ -282,10 +281,17 @@ def _leave_second(probe: Probe, now: float) -> None:
         leave_second(probe.device, probe.outstanding, probe.token, now)
 
 
-def _is_suspect(poll: Poll) -> bool:
-    """Returns True if the device may be silent about an address of the poll."""
-    longer = poll.span is not poll.block.span
-    return longer or poll.device.bad_addresses.is_suspect(poll.block)
+def _suspect(job: Unfinished, *, alone: bool) -> int:
+    """Returns how many failures in a row a silent address may explain: the poll of a block that
+    has it, and a resync near that block."""
+    match job:
+        case Poll(block=block):
+            longer = job.span is not block.span
+            return int(alone and (longer or job.device.bad_addresses.is_suspect(block.span)))
+        case Probe(outstanding=outstanding):
+            return 2 * job.device.bad_addresses.is_suspect(outstanding)
+        case _:
+            return int(isinstance(job, Identify))
 
 
 def _is_short(job: Unfinished) -> bool:

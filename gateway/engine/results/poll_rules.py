@@ -8,6 +8,7 @@ from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.monitor_list import REFUSED_FOR
 from gateway.engine.effects import Effects, Samples
+from gateway.engine.jobs.jobs import Probe, Settle
 from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.schedule.replan_budget import ReplanBudget
@@ -211,6 +212,17 @@ class PollRules:
             device.monitor.allow()  # the bad address in the list may be known now
             self._replans.want(device, now)
 
+    def fell_silent(self, settle: Settle) -> None:
+        """Notes the block before a resync without a reply, after which the device is offline: the
+        resync may have read beside it."""
+        device, after = settle.device, settle.after
+        fell = settle.before is State.FAILING and device.health.state is State.OFFLINE
+        if not (fell and isinstance(after, Probe)):
+            return
+        for poll in self._schedule.polls(device):
+            if poll.block.span == after.outstanding:
+                device.bad_addresses.fell_silent(poll.block)
+
     def unread(
         self, poll: PollEntry, error: DeviceError, now: float, time: int, *, alone: bool = True
     ) -> None:
@@ -230,7 +242,7 @@ class PollRules:
             device.shapes.longer.unanswered(poll.block.span, poll.job.span, now)
             self._schedule.again(poll, counted=False)
             return
-        suspect, half = bad.is_suspect(poll.block), bad.is_half(poll.block)
+        suspect, half = bad.is_suspect(poll.block.span), bad.is_half(poll.block)
         known = suspect and not half
         if not known and not poll.missed and poll.tries < (min(1, retries) if half else retries):
             self._schedule.again(poll)
