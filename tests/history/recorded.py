@@ -17,18 +17,19 @@ from gateway.parts.history.historian import Historian
 from gateway.parts.history.store.file import HistoryFile, oldest
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value
-from tests.history_writer import WEEK, tag, until
+from tests.history_writer import tag, until
 
 SPEED, DOOR = tag("speed"), tag("door")
 SECOND = 10**9
 NOON = 1_795_262_400 * SECOND  # 2026-11-21T12:00:00Z
+DECADES = 50 * 365 * 86_400.0  # seconds: the tests of retention say their own time
 EVERYTHING = "[..]"
 SMALL = 2_000_000  # bytes: makes runs of 1953 samples
 
 
 @contextmanager
 def history(
-    path: Path, keep: float = WEEK, max_size: int = 10**8, **how: Any
+    path: Path, keep: float = DECADES, max_size: int = 10**8, **how: Any
 ) -> Iterator[Historian]:
     historian = Historian(path, keep, max_size, **how)
     historian.start()
