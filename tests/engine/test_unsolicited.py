@@ -625,11 +625,16 @@ lines:
 """
 
 
+def plain(folder: Path) -> Config:
+    """A polled scale that also sends by itself, without a header."""
+    path = folder / "plant.yaml"
+    path.write_text(PLAIN)
+    return load(path)
+
+
 @on_virtual_time
 async def test_the_end_of_a_frame_whose_head_a_request_covered_is_no_value(tmp_path: Path) -> None:
-    path = tmp_path / "plant.yaml"
-    path.write_text(PLAIN)
-    async with running(load(path), replies=lambda _: b"45\r\nW12\r\n") as bench:
+    async with running(plain(tmp_path), replies=lambda _: b"45\r\nW12\r\n") as bench:
         await asyncio.sleep(3)
         assert set(bench.values("weight")) == {12}
         assert bench.values("key") == []
@@ -639,9 +644,7 @@ async def test_the_end_of_a_frame_whose_head_a_request_covered_is_no_value(tmp_p
 async def test_frames_without_a_header_are_heard_between_polls_of_a_busy_line(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "plant.yaml"
-    path.write_text(PLAIN)
-    async with running(load(path), replies=lambda _: b"W12\r\n") as bench:
+    async with running(plain(tmp_path), replies=lambda _: b"W12\r\n") as bench:
         await asyncio.sleep(1)
         said = 0
         for _ in range(200):
@@ -658,9 +661,7 @@ async def test_frames_without_a_header_are_heard_between_polls_of_a_busy_line(
 async def test_a_frame_that_begins_with_the_end_of_a_reply_waits_for_a_silence(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "plant.yaml"
-    path.write_text(PLAIN)
-    async with running(load(path), replies=lambda _: b"W12\r\n+0001") as bench:
+    async with running(plain(tmp_path), replies=lambda _: b"W12\r\n+0001") as bench:
         await asyncio.sleep(1)
         finished = 0
         for _ in range(200):

@@ -59,23 +59,29 @@ def plant_of(protocol: str, retries: int, kind: type[Partly] = Partly) -> Plant:
     return Plant(config, lambda: int(now() * 1e9), opener)
 
 
-@pytest.mark.parametrize("retries", [0, 1, 2])
-@pytest.mark.parametrize("protocol", ["modbus-rtu", "modbus-ascii", "modbus-tcp"])
-@on_virtual_time
-async def test_one_silent_register_costs_its_tag_alone(protocol: str, retries: int) -> None:
-    """With `retries: 1` the device was offline again and again: the resync read beside it."""
-    plant = plant_of(protocol, retries)
+async def looked_at(plant: Plant, after: float, looks: int) -> dict[int, int]:
+    """Returns how often each register was good, once a second from `after` seconds on."""
     [line] = plant.lines
     task = asyncio.create_task(line.run())
-    await asyncio.sleep(30)
+    await asyncio.sleep(after)
     good = dict.fromkeys(NUMBERS, 0)
-    for _ in range(120):
+    for _ in range(looks):
         await asyncio.sleep(1)
         for n in NUMBERS:
             tag = plant.tag(f"meter/t{n}")
             assert tag is not None
             good[n] += plant.sample(tag).quality is Quality.GOOD
     task.cancel()
+    return good
+
+
+@pytest.mark.parametrize("retries", [0, 1, 2])
+@pytest.mark.parametrize("protocol", ["modbus-rtu", "modbus-ascii", "modbus-tcp"])
+@on_virtual_time
+async def test_one_silent_register_costs_its_tag_alone(protocol: str, retries: int) -> None:
+    """With `retries: 1` the device was offline again and again: the resync read beside it."""
+    plant = plant_of(protocol, retries)
+    good = await looked_at(plant, after=30, looks=120)
     assert good.pop(SILENT) == 0
     assert min(good.values()) >= (115 if retries == 2 else 105), good
 
@@ -96,16 +102,6 @@ class Bridge(Partly):
 async def test_a_bridge_that_tells_late_of_two_silent_registers_loses_these_alone() -> None:
     """Both were asked first whenever the unit came back: all tags were bad, for ever."""
     plant = plant_of("modbus-tcp", 1, Bridge)
-    [line] = plant.lines
-    task = asyncio.create_task(line.run())
-    await asyncio.sleep(180)
-    good = dict.fromkeys(NUMBERS, 0)
-    for _ in range(60):
-        await asyncio.sleep(1)
-        for n in NUMBERS:
-            tag = plant.tag(f"meter/t{n}")
-            assert tag is not None
-            good[n] += plant.sample(tag).quality is Quality.GOOD
-    task.cancel()
+    good = await looked_at(plant, after=180, looks=60)
     assert good[100] == good[200] == good[SILENT] == 0
     assert min(good[400], good[500]) >= 55, good

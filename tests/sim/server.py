@@ -142,10 +142,13 @@ class DeviceServer:
 
     def holds(self, sending: "Sending") -> bool:
         """Keeps the reply of a station that is held up."""
-        held = None if sending.station is None else self._replies.get(sending.station)
+        return sending.station is not None and self._hold(sending.station, sending.data)
+
+    def _hold(self, station: "Speaker", reply: bytes) -> bool:
+        held = self._replies.get(station)
         if held is None:
             return False
-        held.append(sending.data)
+        held.append(reply)
         return True
 
     def keeps_from(self, station: "Speaker", data: bytes, request: bytes) -> bool:
@@ -197,9 +200,7 @@ class DeviceServer:
 
     def _pass_late(self, station: "Speaker", reply: bytes) -> None:
         """Passes on the reply to a kept request; its replies may be held up again meanwhile."""
-        if station in self._replies:
-            self._replies[station].append(reply)
-        else:
+        if not self._hold(station, reply):
             self.pass_on(reply)
 
 

@@ -131,8 +131,8 @@ class PollRules:
             self._list_refused(poll, error, now)
             return
         lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)
-        known = device.bad_addresses
-        if lasting and block.span not in known.bad and not known.is_trial(block.span):
+        bad = device.bad_addresses
+        if lasting and block.span not in bad.bad and not bad.is_trial(block.span):
             # The address may exist: noise can change a request, or the device may have restarted.
             if error.refusal is Refusal.ADDRESS and poll.reads.ever and not poll.tries:
                 self._schedule.again(poll)
