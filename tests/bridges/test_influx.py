@@ -42,6 +42,8 @@ TAGS: dict[str, dict[str, Any]] = {
     "mixer/steps": {"type": "float32[2]", "length": 2},
 }
 
+MISSED = 35 * 10**8  # ns: simulated values change once or twice in 1.5 s
+
 
 class Influx:
     """A server of InfluxDB with a database `plant`."""
@@ -190,10 +192,10 @@ def test_what_a_killed_bridge_has_missed_comes_from_the_history(tmp_path: Path) 
             until(state.exists, "the state is kept")
             first.end(signal.SIGKILL)
         before = times()[-1]
-        until(lambda: time.time_ns() > before + 15 * 10**8, "samples are missed")
+        until(lambda: time.time_ns() > before + MISSED, "samples are missed")
         with bridge("influx", *options) as second:
             second.says("samples of mixer since", "recovered")
-            missed = range(before + 1, before + 15 * 10**8)
+            missed = range(before + 1, before + MISSED)
             until(lambda: sum(at in missed for at in times()) > 1, "the missed samples arrive")
             assert second.end() == 0
 
