@@ -193,6 +193,12 @@ class BadAddresses:
             self.splits.add((block.span.area, halves[1].span.start))
         return halves
 
+    def replied(self, span: Span) -> None:
+        """Notes values that were not taken, because they may be another reply: the address may have
+        returned, so it is tried soon."""
+        if (known := self.bad.get(span)) is not None:
+            self.bad[span] = replace(known, refusals=0)
+
     def read(self, block: Block) -> bool:
         """Records a good read.
 

@@ -12,6 +12,7 @@ from gateway.engine.forecast import forecast
 from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled
 from gateway.engine.jobs.poll_entry import OWED
 from gateway.errors import Refusal, Refused
+from gateway.planning.bad_addresses import RETRIES, BadRange
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import Ack
 from gateway.protocols.driver import EVERY_REQUEST, PROOF
@@ -264,6 +265,24 @@ def test_another_plan_remembers_about_which_registers_the_station_was_silent() -
     [again] = rig.engine.schedule.polls(rig.device)
     assert again is not poll
     assert again.reads.owed == OWED
+
+
+def test_an_address_that_returns_is_read_again_soon_although_its_first_replies_count_nothing() -> (
+    None
+):
+    """Three of them wait for each other: each was five minutes after the one before."""
+    rig = doubtful(link_device(retries=0))
+    [poll] = rig.engine.schedule.polls(rig.device)
+    span, bad = poll.block.span, rig.device.bad_addresses
+    bad.bad[span] = BadRange(span, 0, "06", poll.block.tags, refusals=len(RETRIES))
+    bad.clear = False
+    assert rig.device.interval(poll.block) == RETRIES[-1]
+    poll.reads.was_silent()
+    late_read(rig, 0.005)
+    begun = rig.now
+    while not good(rig):
+        late_read(rig, 0.005)
+    assert rig.now - begun < (OWED + 1) * RETRIES[0]
 
 
 @pytest.mark.parametrize("job", [Probe, Settle])

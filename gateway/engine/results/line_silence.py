@@ -22,7 +22,7 @@ from gateway.errors import (
     Unsteady,
 )
 
-FIRST, LONGEST = 20.0, 600.0  # seconds without a reply until the port is opened again
+FIRST, LONGEST = 20.0, 120.0  # seconds without a reply until the port is opened again
 SEVERAL = 3  # transactions without a reply; fewer do not show that the line is dead
 
 

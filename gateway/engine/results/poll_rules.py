@@ -111,6 +111,7 @@ class PollRules:
         if poll.tries < poll.device.timing.retries:
             self._schedule.again(poll)
             return
+        poll.device.bad_addresses.replied(poll.block.span)
         self._end_badly(poll, Reason.GARBLED, error, now, time)
 
     def refused(self, poll: PollEntry, error: Refused, now: float, time: int) -> None:
