@@ -107,6 +107,21 @@ def test_silence_has_its_diagnosis(dev: Device) -> None:
     assert dev.record.failures["other"] == 1
 
 
+def test_the_diagnosis_is_that_of_most_failures_not_of_the_last_one(dev: Device) -> None:
+    def fails(error: NoReply | Garbled) -> str:
+        dev.health.unclear(error, None, 0.0)
+        dev.record.count_failure(error)
+        return dev.diagnosis()
+
+    noise, silence = Garbled("noise"), NoReply("no reply")
+    for _ in range(8):
+        fails(noise)
+    assert "baud rate" in fails(silence)
+    for _ in range(10):
+        fails(silence)
+    assert fails(noise).startswith("No byte came back")
+
+
 def test_a_port_that_refused_a_setting_is_the_diagnosis_of_silence(dev: Device) -> None:
     note = "The device server has baudrate 9600, not 19200: it refused it"
     dev.restart(note=note)
