@@ -195,7 +195,8 @@ class NoReply(Unclear):
 class Garbled(Unclear):
     """Bytes that are no frame, or a frame that is no reply to the request.
 
-    `data` holds the first bytes for the log, `evidence` the kind of fault.
+    The message becomes the outcome of a write or the detail of a value, so it has no bytes. `data`
+    holds the first ones for the log, `evidence` the kind of fault.
     """
 
     def __init__(
@@ -208,3 +209,9 @@ class Garbled(Unclear):
 
 class Unsteady(Garbled):
     """Two good replies that differ although they must be equal."""
+
+
+def log_fields(error: DeviceError) -> dict[str, str]:
+    """Returns what the log tells of an error: why, and the bytes that no sentence has."""
+    heard = error.data if isinstance(error, Garbled) else b""
+    return {"why": str(error)} | ({"bytes": heard.hex(" ")} if heard else {})

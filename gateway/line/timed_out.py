@@ -7,7 +7,7 @@ from typing import Any
 
 from gateway.engine.jobs.jobs import Settled
 from gateway.errors import DeviceError, Evidence, Garbled, NoReply
-from gateway.line.channel import KEPT, Channel
+from gateway.line.channel import Channel
 
 MOST_WAITS = 100  # in one transaction
 
@@ -16,20 +16,19 @@ def verdict(request: bytes, heard: bytes, early: bytes, stray: Evidence | None) 
     """Returns the end of a request without a reply. `heard`: since it was sent; `early`: in place
     of its echo; `stray`: what other frames were."""
     heard = heard or early
-    shown = f"heard {heard[:KEPT].hex(' ')}"
     if not heard:
         return NoReply("no reply")
     if early:
-        return Garbled(f"our own request did not come back: {shown}", heard)
+        return Garbled("our own request did not come back", heard)
     if heard == request:
         return Garbled("heard only our own request", heard, evidence=Evidence.ECHO)
     if stray is Evidence.STATION:
-        return Garbled(f"another station spoke: {shown}", heard, evidence=Evidence.STATION)
+        return Garbled("another station spoke", heard, evidence=Evidence.STATION)
     if stray is Evidence.SLOW:
-        return Garbled(f"only replies to older requests: {shown}", heard, evidence=Evidence.SLOW)
+        return Garbled("only replies to older requests", heard, evidence=Evidence.SLOW)
     if stray is Evidence.SHAPE:
-        return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
-    return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
+        return Garbled("no answer to this", heard, evidence=Evidence.SHAPE)
+    return Garbled("no whole frame", heard, evidence=Evidence.NOISE)
 
 
 @dataclass(slots=True, eq=False)

@@ -192,12 +192,13 @@ async def test_the_evidence_of_a_time_out_is_what_was_heard(heard: str, evidence
     span = Span("D", 0, 3) if heard == "shape" else SPAN
     await driver.read(opened(other, driver), span)
     frame = b"".join(other.station.hear(other.sent[0][1], 0.0))
-    talk.received(
-        {"station": frame, "shape": frame, "noise": b"\xffU\x00", "echo": port.sent[0][1]}[heard]
-    )
+    found = {"station": frame, "shape": frame, "noise": b"\xffU\x00", "echo": port.sent[0][1]}
+    talk.received(found[heard])
     with pytest.raises(Garbled) as caught:
         await asking
     assert caught.value.evidence is evidence
+    assert caught.value.data == found[heard]
+    assert found[heard].hex(" ") not in str(caught.value)
 
 
 @pytest.mark.parametrize(

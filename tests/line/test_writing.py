@@ -3,10 +3,12 @@
 import asyncio
 
 import pytest
+from structlog.testing import capture_logs
 
 from gateway.engine.device.device import Device
 from gateway.engine.results.request_rules import Differs
 from gateway.errors import Refused, Unclear
+from gateway.protocols.vigor.codec import Reply, encode
 from gateway.tags import Tag, WriteResult, WriteRule
 from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
@@ -55,6 +57,40 @@ async def test_an_acknowledged_write_is_done() -> None:
     assert 0 < done.took < 0.2
     assert dev.record.writes == 1
     assert dev.record.slowest_write == pytest.approx(done.took)
+
+
+@pytest.mark.parametrize(
+    ("reply", "why"),
+    [
+        (b"\xff\x01\x80", "no whole frame"),
+        (encode(Reply(2, "51", "00", bytes(2))), "another station spoke"),
+    ],
+)
+@on_virtual_time
+async def test_the_log_has_the_bytes_of_a_strange_reply_and_no_sentence_has(
+    reply: bytes, why: str
+) -> None:
+    """Neither the outcome of a write nor the detail of a value."""
+    near, far = make_tag("D0", write=WriteRule()), make_tag("D1000")
+    line = plant([device([near, far], reply_timeout=0.2, guard=0.2)])
+    station = line.stations[0]
+
+    def strange(request: bytes, now: float) -> list[bytes]:
+        found = station.inner.hear(request, now)
+        is_asked = request[3:5] == b"61" or request[5:9] == b"23D0"  # of D1000
+        return [reply] if is_asked else found
+
+    with capture_logs() as logs:
+        async with running(line):
+            await asyncio.sleep(1)
+            station.answer = strange
+            unclear = (await write(line)).once
+            await asyncio.sleep(10)
+    assert isinstance(unclear, Unclear)
+    assert str(unclear) == line.now[far].detail == why
+    failed = [entry for entry in logs if entry["event"] == "transaction failed"]
+    assert len(failed) > 1
+    assert {(entry["why"], entry["bytes"]) for entry in failed} == {(why, reply.hex(" "))}
 
 
 @pytest.mark.parametrize("obeys", [False, True])

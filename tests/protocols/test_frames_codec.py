@@ -402,4 +402,4 @@ def test_a_wrong_check_is_told_as_a_checksum() -> None:
     (damage,) = FrameReader(RTU).feed(bytes(8))
     assert isinstance(damage, Garbled)
     assert damage.evidence is Evidence.CHECKSUM
-    assert str(damage) == "crc16 0000 is not 001b"
+    assert (str(damage), damage.data) == ("wrong crc16", bytes(8))

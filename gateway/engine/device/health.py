@@ -331,9 +331,8 @@ def diagnosis(trouble: GatewayError | None, silent_causes: str) -> Diagnosis:
         case None:
             return NO_TROUBLE
         case Garbled() as error:
-            found = str(error).partition(": heard")[0]  # the log has the bytes
             advice = _ADVICE.get(error.evidence, "not understood")
-            return Diagnosis(error.evidence.value, f"{advice} ({found})")
+            return Diagnosis(error.evidence.value, f"{advice} ({error})")
         case NoReply():
             return Diagnosis(Evidence.SILENCE.value, f"{_SILENCE} {silent_causes}".strip())
         case error:

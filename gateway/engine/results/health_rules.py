@@ -10,7 +10,7 @@ from gateway.engine.results.staleness import Staleness
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.probes import is_noisy
 from gateway.engine.schedule.schedule import Schedule
-from gateway.errors import DeviceError, Offline
+from gateway.errors import DeviceError, Offline, log_fields
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
 
@@ -67,11 +67,11 @@ class HealthRules:
         device.health.unclear(error, asked, now, known=known, resynced=resynced)
         device.record.count_failure(error)
         device.monitor.forget()  # the device may have restarted
-        name, why = device.name, str(error)
-        if before is State.OFFLINE:  # its probes fail every few seconds
-            self._effects.debug("transaction failed", line=self._line, device=name, why=why)
+        # The probes of an offline device fail every few seconds.
+        log = self._effects.debug if before is State.OFFLINE else self._effects.info
+        log("transaction failed", line=self._line, device=device.name, **log_fields(error))
+        if before is State.OFFLINE:
             return before
-        self._effects.info("transaction failed", line=self._line, device=name, why=why)
         self._staleness.tick(now, time)
         return before
 

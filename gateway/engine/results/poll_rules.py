@@ -21,6 +21,7 @@ from gateway.errors import (
     Refusal,
     Refused,
     Unsteady,
+    log_fields,
 )
 from gateway.planning.bad_addresses import DAMAGED, RETRIES, SILENT
 from gateway.planning.planner import Block, describe
@@ -103,8 +104,7 @@ class PollRules:
         for value in fields:
             if isinstance(value, Garbled):
                 device.record.count_failure(value)
-                heard = value.data.hex(" ")
-                self._effects.info("field garbled", device=device.name, why=str(value), bytes=heard)
+                self._effects.info("field garbled", device=device.name, **log_fields(value))
 
     def unsteady(self, poll: PollEntry, error: Unsteady, now: float, time: int) -> None:
         """Applies two different reads of a block: polls it again, or turns its tags bad."""

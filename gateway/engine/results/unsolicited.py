@@ -11,7 +11,7 @@ from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import Answer, Idle, Result, Traffic, Transacted
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.rule import NEVER, Rule
-from gateway.errors import BadValue, Garbled
+from gateway.errors import BadValue, Garbled, log_fields
 from gateway.protocols.unsolicited import (
     Stale,
     Unsolicited,
@@ -236,5 +236,4 @@ class UnsolicitedFrames(Rule):
             self._effects.bad(tags, reason, time, detail)
 
     def _log(self, event: str, device: Device, damage: Garbled) -> None:
-        data = damage.data.hex(" ")
-        self._effects.info(event, device=device.name, why=str(damage), bytes=data)
+        self._effects.info(event, device=device.name, **log_fields(damage))

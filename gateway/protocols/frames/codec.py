@@ -161,9 +161,9 @@ class FrameReader:
             end += 2
             if len(self._buffer) < end:
                 return None
-            wanted, got = framing.sum_of(self._header, data), bytes(self._buffer[end - 2 : end])
-            if got.upper() != wanted:
-                why = f"error 4, sum {got!r} is not {wanted!r}"
+            got = self._buffer[end - 2 : end]
+            if got.upper() != framing.sum_of(self._header, data):
+                why = "error 4, wrong sum"
                 return self._damage(why, end, evidence=Evidence.CHECKSUM, aligned=True)
         for wanted_byte, why in zip(framing.tail, _tail_errors(framing.tail), strict=True):
             if len(self._buffer) == end:
@@ -194,8 +194,7 @@ class FrameReader:
         if framing.check == "lrc" and not framing.conversion:
             got = got.upper()
         if got != wanted:
-            why = f"{framing.check} {got.hex()} is not {wanted.hex()}"
-            return Garbled(why, data, evidence=Evidence.CHECKSUM)
+            return Garbled(f"wrong {framing.check}", data, evidence=Evidence.CHECKSUM)
         return payload
 
     def _damage(

@@ -103,7 +103,7 @@ def _reply(match: re.Match[bytes]) -> Reply:
     if stray is not None and len(digits) == 2 * MOST_BYTES:
         raise Garbled("a reply without an end", whole, evidence=Evidence.TRUNCATED)
     if stray is not None:
-        raise Garbled(f"{stray.hex().upper()}h in the data of a reply", whole)
+        raise Garbled("no hexadecimal digit in the data of a reply", whole)
     if b"%02X" % (sum(whole[1:-2]) & 0xFF) != check:
         raise Garbled("a reply with a wrong sum", whole, evidence=Evidence.CHECKSUM)
     if len(digits) % 2:
