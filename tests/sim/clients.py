@@ -115,14 +115,14 @@ class Client:
 
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
         """Writes several tags at once: in one frame, or one by one after a refusal."""
-        mark, since = self.mark(), self.judge.now
+        mark, since, carried = self.mark(), self.judge.now, self.bus.carried[self.number]
         most = sum(most_requests(tag) for tag, _ in writes)
-        most += len(writes) > 1
         if self.device.broadcast:
             await asyncio.gather(*(self._tell_all(tag, value) for tag, value in writes))
         else:
             await asyncio.gather(*(self._write_one(t, v, len(writes) > 1) for t, v in writes))
         sent = self.sent(mark)
+        most += len(writes) > 1 or self.bus.carrying[self.number] > carried  # refused together
         if sent > most:
             self.judge.broke(f"{self.device.name}: {len(writes)} writes were sent {sent} times")
         if self.bus.hurt_at < since:
