@@ -1,6 +1,7 @@
 """The `check` command."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,20 @@ def test_check_warns_of_an_overloaded_line(command: Command, tmp_path: Path) -> 
     assert done.code == 0
     assert "warning: line hall is asked for" in done.err
     assert "of what it can carry at 19200 baud: multiply the intervals by" in done.err
+
+
+def test_check_says_the_price_of_proofs(command: Command, tmp_path: Path) -> None:
+    """Not where replies have numbers."""
+    net = {"protocol": "modbus-tcp", "tags": {"level": {"address": "holding:10"}}}
+    lines = {
+        "hall": vigor_line("/dev/ttyUSB9", {"level": {"address": "D10", "every": "200ms"}}),
+        "net": {"port": "tcp://127.0.0.1:502", "devices": {"boiler": net}},
+    }
+    out = command("check", write_config(tmp_path / "config.yaml", free_endpoint(), lines)).out
+    hall, net_ = (part for part in out.split("line ") if part.startswith(("hall: ", "net: ")))
+    load, proven = re.findall(r"  load ([\d.]+)% (?:of the wire|after an extra reply)", hall)
+    assert float(proven) > 1.5 * float(load)
+    assert "after an extra reply" not in net_
 
 
 @pytest.mark.parametrize(("option", "shown"), [("--blocks", True), ("--no-blocks", False)])

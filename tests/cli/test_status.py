@@ -170,6 +170,14 @@ def test_the_programs_at_a_door_are_shown(healthy: dict[str, Any]) -> None:
     assert "-" in text_of(documents)
 
 
+def test_a_doubtful_line_is_shown_with_the_load_of_its_proofs(healthy: dict[str, Any]) -> None:
+    documents = changed(healthy, "lines/hall", expected={"load": 0.12, "load_proven": 0.34})
+    documents["status"]["simulated"] = []
+    assert re.search(r"^hall +open .* 12 % ", text_of(documents), re.MULTILINE)
+    documents["lines/hall"]["doubtful"] = True
+    assert re.search(r"^hall +doubtful .* 34 % ", text_of(documents), re.MULTILINE)
+
+
 def test_the_calls_of_a_modem_are_shown(healthy: dict[str, Any]) -> None:
     documents = changed(healthy, "lines/hall", calls=calling()["calls"])
     assert list(faults(documents)) == []

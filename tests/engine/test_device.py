@@ -4,11 +4,12 @@ import math
 
 import pytest
 
-from gateway.engine.device.device import HALF_LIFE, Device
+from gateway.engine.device.device import HALF_LIFE, PROOF_COST, Device
 from gateway.engine.device.health import State
 from gateway.errors import Evidence, Garbled, NoReply, Unclear
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusRtu
+from gateway.protocols.vigor import Vigor
 from gateway.tags import Reason
 from tests.sim.bench import WIRE
 from tests.sim.plant import device, made_device, make_tag, words
@@ -221,6 +222,24 @@ def test_half_of_the_use_of_the_wire_is_forgotten_every_ten_seconds() -> None:
     assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)
     dev.used(110.0, 110.0)
     assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)
+
+
+@pytest.mark.parametrize(
+    ("driver", "text", "proofs"),
+    [
+        (ModbusRtu(station=1, diagnostics=True), "holding:{}", 1),  # its token
+        (Vigor(station=1), "D{}", 1),  # a read of nine words, which no block has
+        (ModbusRtu(station=1), "holding:{}", 2),  # each of two equal reads for itself
+    ],
+)
+def test_one_proof_is_for_all_blocks_where_its_reply_is_told_from_theirs(
+    driver: AnyDriver, text: str, proofs: int
+) -> None:
+    tags = [make_tag(text.format(n), driver, every=2.0) for n in (0, 500)]
+    dev = made_device("plc", driver, WIRE, driver.timing, tags)
+    assert len(dev.blocks) == 2
+    proof = dev.seconds(PROOF_COST) + dev.settled_after
+    assert dev.load_of_proofs == pytest.approx(proofs * proof / 2.0)
 
 
 def test_the_widest_block_gives_the_proof_when_a_narrow_one_was_read_last() -> None:

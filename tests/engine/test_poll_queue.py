@@ -198,6 +198,25 @@ class AnyOrder(RuleBasedStateMachine):
         poll.device.used(self.now + took, self.now)
         self.now += took
 
+    @rule(which=st.integers(0, 99), on_demand=st.booleans())
+    def expedite(self, which: int, *, on_demand: bool) -> None:
+        poll = self.polls[which % len(self.polls)]
+        if poll not in self.taken and poll.device.health.online:
+            self.queue.expedite(poll, on_demand=on_demand)
+            tickets = [one.ticket for one in self.queue.expedited]
+            assert poll.ticket in tickets
+            assert tickets == sorted(tickets, reverse=True)  # on demand behind the others
+
+    @rule()
+    def take_expedited(self) -> None:
+        self.ripen(0.0)
+        if self.queue.expedited:
+            poll = self.queue.expedited.popleft()
+            assert poll.live
+            assert poll.device.health.online
+            poll.ticket = NOT_QUEUED
+            self.taken.append(poll)
+
     @rule(pause=st.sampled_from([0.0, 1.0]))
     def put_back(self, pause: float) -> None:
         for poll in self.taken:

@@ -250,6 +250,21 @@ async def test_a_bit_write_whose_word_cannot_be_read_sends_no_write() -> None:
 
 
 @on_virtual_time
+async def test_b3_8_a_telephone_number_is_written_and_read_back() -> None:
+    number = make_tag("D9110", type="telephone", write=WriteRule(verify=True))
+    dev = device([number])
+    line = plant([dev])
+    async with running(line):
+        await asyncio.sleep(1)
+        outcome = line.submit(dev, number, "2620-4976")
+        await asyncio.sleep(3)
+        assert isinstance(outcome.once, WriteResult)
+        assert outcome.once.value == "2620-4976"
+        assert line.now[number].value == "2620-4976"
+        assert line.stations[0].memory.read("D9", 9110, 6) == [0x0262, 0x6794, 0xE, 0, 0, 0]
+
+
+@on_virtual_time
 async def test_a_bit_of_a_bit_area_is_written_alone() -> None:
     line, _, tag = one(WriteRule(verify=True), "M12")
     async with running(line):

@@ -30,7 +30,7 @@ NORTH, LIVENESS, DOORS = "north", "liveness", "doors"
 MOST = ("most timers", "most open")  # counts of which the largest is printed
 # Counts in the total.
 WORDS = ("frames", "good samples", *(case.value for case in Case if case.value), "internal errors")
-DOOR_WORDS = ("read", "written", "value", "no reply", "wire lent", "reload")
+DOOR_WORDS = ("read", "written", "value", "no reply", "wire lent", "reload", "internal errors")
 NORTH_WORDS = ("published", "received", "lost by congestion", "answers", "pages", "executed")
 
 

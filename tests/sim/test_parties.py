@@ -2,9 +2,11 @@
 
 import asyncio
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
+from gateway.engine.engine import Engine
 from gateway.errors import Busy, GatewayError, Unclear
 from gateway.protocols.checksums import byte_sum
 from gateway.protocols.vigor.codec import Request, encode
@@ -21,6 +23,7 @@ from tests.sim.plant import make_tag
 from tests.sim.requests import shape_of
 from tests.sim.transfers import MAY_COME, Row
 from tests.sim.virtual import now, on_virtual_time
+from tests.sim.world import run
 
 ASK, LIKE, OTHER = b"A1", b"A2", b"B1"  # the letter is the shape
 
@@ -160,6 +163,22 @@ def test_a_campaign_continues_where_it_ended(
     monkeypatch.setattr("sys.argv", ["campaign", "--total", result])
     assert campaign.main() == 0
     assert capsys.readouterr().out.startswith("lean: 2 seeds, 0.02 hours")
+
+
+def test_an_error_of_an_engine_is_in_the_total_of_a_campaign(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(*_: object) -> NoReturn:
+        raise IndexError("no first entry")
+
+    monkeypatch.setattr(Engine, "conclude", fails)
+    story = run(0, 0.01, "lean")
+    assert set(story.rules()) == {"internal error"}
+    total = campaign.Total()
+    total.add(story)
+    errors = story.counts["internal errors"]
+    assert errors > 0
+    assert f" {errors} internal errors, 1 seeds with a broken rule" in str(total)
 
 
 DONE = WriteResult(1, 0, 0.1)

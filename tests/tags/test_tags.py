@@ -1,6 +1,7 @@
 """Tags: scale and offset, bits of words, limits of writing."""
 
 import math
+from decimal import Decimal
 from typing import Any
 
 import pytest
@@ -10,6 +11,8 @@ from hypothesis import strategies as st
 from gateway.errors import BadValue
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Quality, Reason, Tag, WriteRule, bad, good
+from gateway.tags.shaping import Bounds
+from gateway.tags.transfer import TransferRule
 from gateway.values import Kind, Layout, Order, Value, ValueType, parse_type
 from tests.tag_settings import grouped
 
@@ -210,6 +213,29 @@ def test_rounding_to_the_devices_steps_does_not_pass_a_limit() -> None:
         with pytest.raises(BadValue, match="the device holds"):
             setpoint.encode(value)
     assert setpoint.encode(1.34) == [13]
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale"), [("int16", 0.1), ("int16", 0.3), ("float32", 0.1), ("float32", 1.0)]
+)
+def test_limits_and_clamps_are_decimals_and_so_is_what_a_transfer_carries(
+    kind: str, scale: float
+) -> None:
+    """0.3 is the limit 0.3, although 3 x 0.1 is more than 0.3 in floats."""
+    step = Decimal(repr(scale)) if kind == "int16" else Decimal("0.1")
+    carries = TransferRule(number=1, source="a/x", target="b/y", text=("a/x", "b/y"), scale=0.1)
+    for number in range(-120, 121):
+        value, tenth = float(step * number), float(step * number / 10)
+        only = tag(kind, scale=scale, write=WriteRule(min=value, max=value))
+        units = only.encode(value)
+        assert only.from_units(units) == value
+        assert carries.value(value, whole=False) == tenth
+        assert tag("float64", write=WriteRule(min=tenth, max=tenth)).encode(tenth)
+        for clamp in (Bounds(high=value), Bounds(low=value)):
+            clamped = tag(kind, scale=scale, clamp=clamp, range=clamp, write=WriteRule())
+            assert clamped.encode(value) == units
+            assert clamped.from_units(units) == value
+            assert not clamp.exclude(value)
 
 
 @given(
