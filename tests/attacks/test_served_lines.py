@@ -5,6 +5,8 @@ import os
 import select
 import signal
 import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -38,10 +40,23 @@ class Wire:
         os.close(self._master)
         os.close(self._slave)
 
+    def say(self, data: bytes) -> None:
+        os.write(self._master, data)
+
+    @contextmanager
+    def heard_by(self, take: Callable[[bytes], None]) -> Iterator[None]:
+        """Passes on what arrives."""
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._master, lambda: take(os.read(self._master, 4096)))
+        try:
+            yield
+        finally:
+            loop.remove_reader(self._master)
+
     async def ask(self, request: bytes, size: int) -> bytes:
         """Returns so many bytes of the reply."""
         loop = asyncio.get_running_loop()
-        os.write(self._master, request)
+        self.say(request)
         reply = b""
         async with asyncio.timeout(300):
             while len(reply) < size:
@@ -54,7 +69,7 @@ class Wire:
 
     def exchange(self, request: bytes) -> bytes:
         """Returns one reply that ends with ETX and a sum; blocks."""
-        os.write(self._master, request)
+        self.say(request)
         reply = b""
         while b"\x03" not in reply[:-2]:
             assert select.select([self._master], [], [], 5)[0], f"only {reply!r}"

@@ -49,6 +49,15 @@ def test_a_read_shows_the_echo_before_any_write(delay: float) -> None:
     assert [one for _, one in on_the_wire(made, requests, delay)] == [VALUE] + [WRITE] * 5
 
 
+def test_echoes_on_their_way_keep_their_order() -> None:
+    """The master writes on after each reply: no value of before is written again."""
+    made, other = bench(), rtu("01 06 0004 0009")
+    assert len(on_the_wire(made, [(1.0, READ)], 0.08)) == 1
+    requests = [(3.0, other), (3.03, WRITE), (3.075, WRITE)]
+    assert [reply for _, reply in on_the_wire(made, requests, 0.08)] == [other, WRITE, WRITE]
+    assert made.written == [{"setpoint": 9}, {"setpoint": 7}, {"setpoint": 7}]
+
+
 def test_an_ascii_echo_is_no_request_either() -> None:
     made, write = bench("modbus-ascii"), ascii_frame("01 06 0004 0007")
     requests = [(1.0, ascii_frame("01 03 0000 0001")), *((2.0 + n, write) for n in range(5))]

@@ -13,6 +13,7 @@ from enum import Enum
 _LATEST = 1.0  # seconds after its reply within which an echo arrives, as long as none came later
 _OLDEST, _MOST_OLD = 10.0, 16  # seconds and replies for which a later echo is recognised
 _EARLY = 0.5  # times the shortest known delay: a frame before that is no echo
+_LOST = 1.5  # times the shortest known delay: an echo that did not arrive until then was lost
 _MISSES = 3  # replies without an echo, in a row, until the adapter does not echo any more
 _AGAIN, _MORE = 8, 8  # equal frames in a row until the station asks again; then so many times more
 
@@ -72,11 +73,15 @@ class Echo:
             self._known, self._delay = True, min(self._delay or 9.0, now - one.at)
         elif self.told is None and not self._known:
             return self._doubt(place)
-        elif now - one.at < _EARLY * self._delay:
+        elif now - one.at < _EARLY * self._delay or self._older_may_arrive(place, now):
             return Sort.REQUEST
         self._misses = self._equal = 0
         del self._replies[: place + 1]
         return Sort.ECHO
+
+    def _older_may_arrive(self, place: int, now: float) -> bool:
+        """Returns True while the echo before this one may arrive: echoes keep their order."""
+        return place > 0 and now - self._replies[place - 1].at < _LOST * self._delay
 
     def _late(self, frame: bytes, now: float) -> Sort:
         """Judges a frame that is equal to no reply of the last time: an echo may be slower."""
