@@ -1,4 +1,4 @@
-"""A served RTU line whose adapter returns each reply late, and a panel that writes at once again."""
+"""A served RTU line whose adapter returns replies late, and a panel that writes at once again."""
 
 import asyncio
 from itertools import groupby
