@@ -6,11 +6,12 @@ import select
 import signal
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
 from gateway.protocols.checksums import crc16
+from gateway.protocols.vigor.codec import Reply, Request, encode
 from tests.e2e.processes import free_port, started, write_config
 from tests.serving.easy_link import EXAMPLE, EasyLink
 from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint
@@ -21,6 +22,7 @@ TAGS = {
     "order": {"address": "holding:100", "type": "uint32"},
 }
 STATION = {"station": 1, "accept": ["holding:100..holding:109"], "stale_after": "300ms"}
+PAUSES = 0.06, 0.1  # seconds between the pieces of a request
 MIXER = {"speed": {"address": "D100", "write": True, "every": "50ms"}}
 
 
@@ -192,3 +194,49 @@ async def test_a_master_and_a_client_exchange_values(tmp_path: Path) -> None:
             assert await panel.ask("03 0064 0002") == "83 04"
             await panel.close()
             assert program.end() == 0
+
+
+async def answered_in_pieces(wire: Wire, request: bytes, reply: bytes) -> bool:
+    """Asks in three pieces. A machine that is busy may make a pause too long: asks some times."""
+    third = len(request) // 3
+    pieces = request[:third], request[third : 2 * third], request[2 * third :]
+    received, whole = b"", asyncio.Event()
+
+    def take(data: bytes) -> None:
+        nonlocal received
+        received += data
+        if received.endswith(reply):
+            whole.set()
+
+    with wire.heard_by(take):
+        for _ in range(10):
+            wire.say(pieces[0])
+            for pause, piece in zip(PAUSES, pieces[1:], strict=True):
+                await asyncio.sleep(pause)
+                wire.say(piece)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(whole.wait(), 3)
+                return True
+    return False
+
+
+async def test_requests_in_pieces_are_answered_at_300_baud(tmp_path: Path) -> None:
+    order = {"order": {"address": "D100"}}
+    vigor = {"protocol": "vigor", "station": 1, "accept": ["D100"], "tags": order}
+    plc = {"protocol": "modbus-rtu", **STATION, "tags": {"order": {"address": "holding:100"}}}
+    slow = {"baudrate": 300, "serve": True}
+    with Wire() as wire, Wire() as link:
+        lines = {
+            "wire": {"port": wire.path, **slow, "devices": {"plc": plc}},
+            "link": {"port": link.path, **slow, "devices": {"vigor": vigor}},
+        }
+        file = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+        with started(file) as program:
+            for line in lines:
+                program.says("line open", f"line={line}")
+            for number in range(3):
+                write = rtu(f"01 06 0064 000{number}")
+                assert await answered_in_pieces(wire, write, write)
+                body = b"1CC802%02X00" % number
+                done = encode(Reply(1, "61", "00"))
+                assert await answered_in_pieces(link, encode(Request(1, "61", body)), done)
