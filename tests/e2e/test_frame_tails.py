@@ -50,7 +50,7 @@ def stop_within_a_frame(
 
 
 def is_good(sample: Received) -> bool:
-    return sample.json["quality"] == "good"
+    return bool(sample.json["quality"] == "good")
 
 
 async def has_come(seen: Subscription) -> bool:
