@@ -1,11 +1,16 @@
 """A served line beside its own echo, and beside a master that repeats itself at once."""
 
+import asyncio
 import heapq
+from typing import cast
 
 import pytest
 
+from gateway.parts.serving.conversation import Conversation
+from gateway.transport import Port
 from tests.serving.bench import Bench
 from tests.serving.test_modbus_serial import READ, VALUE, ascii_frame, bench, rtu
+from tests.sim.virtual import on_virtual_time
 
 WRITE = rtu("01 06 0004 0007")
 BUSY = rtu("01 86 06")
@@ -56,6 +61,30 @@ def test_echoes_on_their_way_keep_their_order() -> None:
     requests = [(3.0, other), (3.03, WRITE), (3.075, WRITE)]
     assert [reply for _, reply in on_the_wire(made, requests, 0.08)] == [other, WRITE, WRITE]
     assert made.written == [{"setpoint": 9}, {"setpoint": 7}, {"setpoint": 7}]
+
+
+class Written(list[bytes]):
+    """A port that keeps what is written."""
+
+    write = list.append
+
+
+@on_virtual_time
+async def test_an_echo_in_the_pause_before_a_reply_does_not_cancel_it() -> None:
+    """It is no next request."""
+    made, port = bench(), Written()
+    talk = Conversation(made.line)
+    talk.opened(cast(Port, port))
+    other = rtu("01 06 0004 0009")
+    for received in ((READ,), (VALUE,), (WRITE,), (other, WRITE), (other,)):
+        for data in received:
+            talk.received(data)
+        await asyncio.sleep(0.02)
+    assert (port, made.line.unsent) == ([VALUE, WRITE, other], 0)
+    talk.received(WRITE)
+    talk.received(READ)
+    await asyncio.sleep(0.02)
+    assert (port[3:], made.line.unsent) == ([VALUE], 1)
 
 
 def test_an_ascii_echo_is_no_request_either() -> None:

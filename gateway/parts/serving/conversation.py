@@ -39,10 +39,11 @@ class Conversation:
         if line.why_not(now):  # what waited in the system while this process was held
             self._begin_again()
             return
-        self._following += len(data)
+        heard = self._machine.hear(data, now)
+        if not heard.echo:
+            self._following += len(data)
         if self._following > NOISE:
             self._cancel()
-        heard = self._machine.hear(data, now)
         while heard.more:
             self._take(heard, now)
             heard = self._machine.hear(b"", now)

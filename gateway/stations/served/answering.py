@@ -31,6 +31,7 @@ class Heard(NamedTuple):
     stale: int = 0  # requests that later bytes have followed: neither carried out nor answered
     lost: bool = False  # where the next frame begins cannot be found any more
     more: bool = False  # another request waits: hear no bytes for it
+    echo: bool = False  # our own reply came back, and nothing else: no request follows
 
 
 SILENCE = Heard()

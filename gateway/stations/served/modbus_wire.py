@@ -88,15 +88,17 @@ class _Serial:
     def hear(self, data: bytes, now: float) -> Heard:
         reader, echo = self._reader, self._wire.echo
         reader.echoes = echo.pending(now)
-        frames, sort = list[Frame](), Sort.REQUEST
+        frames, sort, echoed = list[Frame](), Sort.REQUEST, False
         for frame in reader.feed(data, now):
             judged = echo.judge(reader.encode(frame), now)
-            if judged is not Sort.ECHO:
+            if judged is Sort.ECHO:
+                echoed = True
+            else:
                 frames.append(frame)
                 sort = judged
         ours = [frame for frame in frames if frame.station in self._stations or frame.station == 0]
         if not ours:
-            return SILENCE
+            return Heard(echo=echoed and not frames and not reader.following)
         request = frames[-1]
         # An exception is the reply of a twin, or our own: an answer to it would return.
         if request is not ours[-1] or reader.following > NOISE or request.pdu[0] & EXCEPTION:
