@@ -88,18 +88,12 @@ class _Serial:
     def hear(self, data: bytes, now: float) -> Heard:
         reader, echo = self._reader, self._wire.echo
         reader.echoes = echo.pending(now)
-        frames, sort, echoed = list[Frame](), Sort.REQUEST, False
-        for frame in reader.feed(data, now):
-            judged = echo.judge(reader.encode(frame), now)
-            if judged is Sort.ECHO:
-                echoed = True
-            else:
-                frames.append(frame)
-                sort = judged
-        ours = [frame for frame in frames if frame.station in self._stations or frame.station == 0]
+        judged = [(one, echo.judge(reader.encode(one), now)) for one in reader.feed(data, now)]
+        frames = [(one, sort) for one, sort in judged if sort is not Sort.ECHO]
+        ours = [one for one, _ in frames if one.station in self._stations or one.station == 0]
         if not ours:
-            return Heard(echo=echoed and not frames and not reader.following)
-        request = frames[-1]
+            return Heard(echo=bool(judged) and not frames and not reader.following)
+        request, sort = frames[-1]
         # An exception is the reply of a twin, or our own: an answer to it would return.
         if request is not ours[-1] or reader.following > NOISE or request.pdu[0] & EXCEPTION:
             return Heard(stale=len(ours))
