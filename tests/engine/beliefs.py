@@ -19,6 +19,7 @@ from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
 from gateway.engine.results.pipelining import TRY_AGAIN
 from gateway.engine.results.second_requests import MOST_SILENT
 from gateway.planning.bad_addresses import RETRIES, SPLIT_LONGEST
+from gateway.protocols.resync_kind import MISSES
 
 AT_ONCE = 0.0
 
@@ -188,6 +189,13 @@ BELIEFS = (
         "ten minutes",
         "their replies have a form that was not requested for long",
         WARY_FOR,
+    ),
+    Belief(
+        "the kind of resync that a station answers",
+        "a reply to a loopback, or to three reads after lost loopbacks",
+        f"{MISSES} loopbacks in a row without a reply, or two reads",
+        "both kinds are sent in turn",
+        MISSES * PROBE_PAUSE * (1 + PROBE_SPREAD),
     ),
     Belief(
         "a station replies later than late_guard",

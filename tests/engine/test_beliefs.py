@@ -1,6 +1,8 @@
 """No belief is for ever: each is contradicted after an hour of its truth, and given up in time."""
 
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +10,7 @@ import pytest
 
 from gateway.engine.device.health import FORGOTTEN, State
 from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
-from gateway.engine.device.probe_pace import PROBE_SPREAD
+from gateway.engine.device.probe_pace import PROBE_PAUSE, PROBE_SPREAD
 from gateway.engine.device.records import QUICKEST_OF, Replies
 from gateway.engine.device.reply_shapes import ProofPace
 from gateway.engine.device.twins import Twins
@@ -23,6 +25,7 @@ from gateway.engine.schedule.probes import is_noisy
 from gateway.errors import Evidence, Garbled, NoReply, Refusal, Refused
 from gateway.line.channel import Echo
 from gateway.planning.planner import Block
+from gateway.protocols.resync_kind import ResyncKind
 from gateway.tags import WriteRule
 from tests.engine.beliefs import BELIEFS, Belief, table
 from tests.engine.rig import SILENCE, Rig, bit_device, link_device, tcp_device
@@ -378,6 +381,33 @@ def silent_about_seconds() -> Way:
     return lambda after: pace.seconds_from <= HOUR + after
 
 
+def kind_of_resync() -> Way:
+    kinds, tokens = (ResyncKind(), ResyncKind()), count(2, 2)
+
+    def asked(kind: ResyncKind, answered: bool | None) -> bool:
+        """Sends a resync to a station that answers loopbacks, or else reads; None: neither."""
+        token = next(tokens)
+        loopback = kind.is_loopback(token)
+        with suppress(NoReply), kind.sent(token, loopback=loopback):
+            if loopback is not answered:
+                raise NoReply("no reply")
+        return loopback
+
+    for one, loops in zip(kinds, (True, False), strict=True):
+        for _ in range(int(HOUR)):
+            asked(one, loops)
+        assert all(asked(one, loops) is loops for _ in range(20))
+
+    def given_up(after: float) -> bool:
+        probes = int(after / (PROBE_PAUSE * (1 + PROBE_SPREAD)))
+        for one in kinds:
+            for _ in range(probes):
+                asked(one, None)
+        return all(len({asked(one, None) for _ in range(3)}) == 2 for one in kinds)
+
+    return given_up
+
+
 def later_than_its_guard() -> Way:
     health = link_device().health
     health.left_outstanding(None, HOUR)
@@ -426,6 +456,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "noise destroys its replies": noise,
     "the device lacks a read with a form of its own": no_form_of_its_own,
     "the device is silent about second requests of resyncs": silent_about_seconds,
+    "the kind of resync that a station answers": kind_of_resync,
     "a station replies later than late_guard": later_than_its_guard,
     "a device that returns is as quick as before": as_quick_as_before,
     "earlier requests are kept": kept_requests,

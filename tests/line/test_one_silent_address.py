@@ -1,6 +1,8 @@
 """A device that is silent about one address loses this tag alone."""
 
 import asyncio
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 NUMBERS = (100, 200, 300, 400, 500)
 SILENT = 300
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Partly:
@@ -31,23 +34,32 @@ class Partly:
         return replies
 
     def _meant(self, data: bytes) -> bool:
-        match self.framing:
-            case "modbus-rtu":
-                pdu = data[1:-2]
-            case "modbus-ascii":
-                pdu = bytes.fromhex(data[1:-4].decode())[1:]
-            case _:
-                pdu = data[7:]
+        pdu = self.pdu_of(data)
         start, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
         return pdu[0] == 3 and start <= SILENT < start + count
 
+    def pdu_of(self, data: bytes) -> bytes:
+        match self.framing:
+            case "modbus-rtu":
+                return data[1:-2]
+            case "modbus-ascii":
+                return bytes.fromhex(data[1:-4].decode())[1:]
+            case _:
+                return data[7:]
 
-def plant_of(protocol: str, retries: int, kind: type[Partly] = Partly) -> Plant:
+
+def plant_of(
+    protocol: str,
+    retries: int,
+    kind: Callable[[Any, str], Partly] = Partly,
+    line: Mapping[str, Any] = NOTHING,
+    **settings: Any,
+) -> Plant:
     tags = {f"t{n}": {"address": f"holding:{n}", "every": "1s"} for n in NUMBERS}
-    device = {"protocol": protocol, "station": 1, "retries": retries, "tags": tags}
+    device = {"protocol": protocol, "station": 1, "retries": retries, "tags": tags, **settings}
     port = "tcp://127.0.0.1:1502" if protocol == "modbus-tcp" else "tcp://127.0.0.1:4001"
-    data = {"lines": {"hall": {"port": port, "baudrate": 19200, "devices": {"meter": device}}}}
-    config = built(data)
+    hall = {"port": port, "baudrate": 19200, "devices": {"meter": device}, **line}
+    config = built({"lines": {"hall": hall}})
 
     def opener(line: LineConfig) -> Any:
         [settings] = line.devices

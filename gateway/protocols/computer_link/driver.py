@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, TypeVar
 
-from gateway.errors import BadValue, ConfigError, Unclear
+from gateway.errors import BadValue, ConfigError
 from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.computer_link.access import (
     Access,
@@ -40,7 +40,6 @@ from gateway.protocols.computer_link.replies import (
     describe_stray,
     model_name,
 )
-from gateway.protocols.computer_link.resync import ResyncKind
 from gateway.protocols.computer_link.traffic import Read, learn, link_traffic_reader
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import (
@@ -56,6 +55,7 @@ from gateway.protocols.driver import (
 )
 from gateway.protocols.harmless import HarmlessReads, resync_by_reads
 from gateway.protocols.listening import Learn, TrafficReader
+from gateway.protocols.resync_kind import ResyncKind
 
 LinkTalk = Talk[Frame]
 T = TypeVar("T")
@@ -268,22 +268,15 @@ class ComputerLink:
         """
         reads = self._harmless(outstanding, spans)
         loopback = not reads or self._kind.is_loopback(probe_token)
-        try:
+        with self._kind.sent(probe_token, loopback=loopback):
             if loopback:
                 await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
-                told = EVERY_REQUEST
-            else:
-                told = await resync_by_reads(
-                    lambda span: self.read(talk, span),
-                    *(probe_token, outstanding, reads.pick, self.reply_shape),
-                )
-                if self.monitor:  # the length of the reply to a list is not known here
-                    told = 0
-        except Unclear:
-            self._kind.unanswered(loopback=loopback)
-            raise
-        self._kind.answered(loopback=loopback)
-        return told
+                return EVERY_REQUEST
+            told = await resync_by_reads(
+                lambda span: self.read(talk, span),
+                *(probe_token, outstanding, reads.pick, self.reply_shape),
+            )
+            return 0 if self.monitor else told  # the length of the reply to a list: not known here
 
     def _harmless(self, outstanding: Span | None, spans: Sequence[Span]) -> HarmlessReads:
         """Returns short reads inside the spans; if all have one length, around them too."""

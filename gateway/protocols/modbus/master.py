@@ -22,6 +22,7 @@ from gateway.protocols.modbus.frame import Frame, answer_length
 from gateway.protocols.modbus.identity import NAMES, identify
 from gateway.protocols.modbus.settings import Settings
 from gateway.protocols.modbus.traffic import Read
+from gateway.protocols.resync_kind import ResyncKind
 
 T = TypeVar("T")
 _REMEMBERED = 1024  # spans whose request is kept ready
@@ -44,11 +45,13 @@ class Master(Settings):
 
     _numbers: Iterator[int] = field(init=False, repr=False, compare=False)
     _prepared: dict[Span, ReadRequest] = field(init=False, repr=False, compare=False)
+    _kind: ResyncKind = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
         object.__setattr__(self, "_numbers", count(1) if self.numbered else repeat(0))
         object.__setattr__(self, "_prepared", {})
+        object.__setattr__(self, "_kind", ResyncKind())
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
         request, head, length, chars, units = self._prepared.get(span) or self._prepare(span)
@@ -174,7 +177,8 @@ class Master(Settings):
         probe_token: int,
         spans: Sequence[Span] = (),
     ) -> int:
-        """Reads another byte count than the `outstanding` read, or sends a token by function 08.
+        """Reads another byte count than the `outstanding` read, or sends a token by function 08,
+        as the device answers.
 
         Function 08 is not used while its reply may be an echo: a dead device would seem online.
         An exception names no address: it may be the late reply to the `outstanding` read. So one
@@ -184,20 +188,26 @@ class Master(Settings):
         resync reads one of them, in turn, and the others read beyond the spans.
         """
         pick = self._harmless_pick(outstanding, spans)
-        loopback = self.diagnostics and (self.numbered or not talk.may_echo)
-        if not loopback and not self.numbered:
-            return await resync_by_reads(
-                lambda span: self.read(talk, span), probe_token, outstanding, pick, self.reply_shape
-            )
-        try:
-            if loopback:
-                await self._loopback(talk, probe_token & 0xFFFF)
-            else:
-                await self.read(talk, pick(probe_token))
-        except Refused:
-            if not self.numbered:
-                raise
-        return EVERY_REQUEST
+        loopback = self._may_loop(probe_token) and (self.numbered or not talk.may_echo)
+        with self._kind.sent(probe_token, loopback=loopback):
+            if not loopback and not self.numbered:
+                return await resync_by_reads(
+                    lambda span: self.read(talk, span),
+                    *(probe_token, outstanding, pick, self.reply_shape),
+                )
+            try:
+                if loopback:
+                    await self._loopback(talk, probe_token & 0xFFFF)
+                else:
+                    await self.read(talk, pick(probe_token))
+            except Refused:
+                if not self.numbered:
+                    raise
+            return EVERY_REQUEST
+
+    def _may_loop(self, token: int) -> bool:
+        """Returns True if the resync with this token is by function 08, where nothing echoes."""
+        return self.diagnostics and self._kind.is_loopback(token)
 
     def _harmless_pick(
         self, outstanding: Span | None, spans: Sequence[Span]
@@ -270,7 +280,7 @@ class Master(Settings):
         self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
     ) -> Hashable:
         """None for function 08 with its token."""
-        if self.diagnostics:
+        if self._may_loop(probe_token):
             return None
         inside = HarmlessReads(spans, outstanding, self.reply_shape)
         if probe_token == PROOF and inside.proof() is None:
