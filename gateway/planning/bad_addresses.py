@@ -128,7 +128,7 @@ class BadAddresses:
     silenced: set[Span] = field(default_factory=set)  # one failure halves these, also for later
     clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
-    _fell: Span | None = None  # the block before a resync without a reply, and not read since
+    _fell: set[Span] = field(default_factory=set)  # fell silent once, and not read since
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
     _rejoin_at: float | None = None
     _rejoin_pause: float = SPLIT_FIRST
@@ -167,9 +167,7 @@ class BadAddresses:
         Once this is noise, or the device. The second time, without a read of the block between,
         the device may be silent about an address of it.
         """
-        if block.span == self._fell:
-            self.silenced.add(block.span)
-        self._fell = block.span
+        (self.silenced if block.span in self._fell else self._fell).add(block.span)
         self.clear = False
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
@@ -209,8 +207,7 @@ class BadAddresses:
         if node is not None:
             node.good = True
         self.silenced.discard(block.span)
-        if block.span == self._fell:
-            self._fell = None
+        self._fell.discard(block.span)
         if self._suspected:  # the whole block is read: its halves were no cure
             area, start, size = block.span
             self._suspected -= {(area, n) for n in range(start + 1, start + size)}
@@ -295,6 +292,7 @@ class BadAddresses:
     def take_over(self, old: "BadAddresses", blocks: Collection[Span]) -> None:
         """Goes on with the searches of the same station, which has a new plan of these blocks."""
         self.silenced |= (old.silenced | old._open_spans()).intersection(blocks)
+        self._fell |= old._fell.intersection(blocks)
         ended = (root.splits() for root in old.searches if root.settled())
         suspected = old._suspected.union(*ended)
         self._suspected |= {cut for cut in suspected if _is_inside(cut, blocks)}

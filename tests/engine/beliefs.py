@@ -13,6 +13,7 @@ from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
 from gateway.engine.device.turnaround import LEARN_EVERY
 from gateway.engine.device.twins import FOR
+from gateway.engine.jobs.poll_entry import OWED
 from gateway.engine.jobs.unanswered import SEEN_FOR
 from gateway.engine.results.bit_writes import LACKED_FOR
 from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
@@ -105,6 +106,20 @@ BELIEFS = (
         "a good read; it is tried again after growing pauses",
         "it is read in its block",
         RETRIES[-1],
+    ),
+    Belief(
+        "a block may hold an address about which the device is silent",
+        "the device went offline at its read, or twice at the resync after it",
+        "a good read of the block",
+        "one lost reply is noise again, and does not halve it",
+        AT_ONCE,
+    ),
+    Belief(
+        "the station was silent about a read",
+        "no reply to it",
+        f"{OWED} replies in a row, or one that cannot be another one",
+        "a reply that comes alone on a doubtful line is a value again, with its proof",
+        AT_ONCE,
     ),
     Belief(
         "block too long",

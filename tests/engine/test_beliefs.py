@@ -15,6 +15,7 @@ from gateway.engine.device.records import QUICKEST_OF, Replies
 from gateway.engine.device.reply_shapes import ProofPace
 from gateway.engine.device.twins import Twins
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
+from gateway.engine.jobs.poll_entry import OWED, BlockReads
 from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
 from gateway.engine.results.bit_writes import BitWrites
@@ -185,6 +186,40 @@ def refused_address() -> Way:
         return not rig.device.bad_addresses.bad and len(rig.device.blocks) == 1
 
     return given_up
+
+
+def fell_silent() -> Way:
+    device = link_device()
+    (block, *_), bad = device.blocks, device.bad_addresses
+    for _ in range(int(HOUR)):
+        bad.fell_silent(block)
+        bad.went_silent(block)
+    assert bad.is_suspect(block.span)
+
+    def given_up(_: float) -> bool:
+        bad.read(block)
+        bad.fell_silent(block)  # it begins to count again
+        return not bad.is_suspect(block.span)
+
+    return given_up
+
+
+def silent_about_a_read() -> Way:
+    device, found = link_device(), []
+    block = device.blocks[0]
+    for certain in (False, True):
+        reads = BlockReads()
+        for _ in range(int(HOUR)):
+            reads.was_silent()
+        for _ in range(OWED - 1):
+            reads.replied()
+        assert reads.owed
+        if certain:
+            reads.take(block, [0] * block.span.size, HOUR, 0)
+        else:
+            reads.replied()
+        found.append(reads)
+    return lambda _: not any(reads.owed for reads in found)
 
 
 def block_too_long() -> Way:
@@ -444,6 +479,8 @@ WAYS: dict[str, Callable[[], Way]] = {
     "two stations have its number": twins,
     "takes one request at a time": one_at_a_time,
     "refused address": refused_address,
+    "a block may hold an address about which the device is silent": fell_silent,
+    "the station was silent about a read": silent_about_a_read,
     "block too long": block_too_long,
     "refuses monitor lists": monitor_list,
     "refuses a longer read": longer_read,

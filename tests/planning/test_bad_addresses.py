@@ -182,6 +182,27 @@ def test_a_search_that_is_dropped_goes_on_after_one_failure_of_the_whole_block()
     assert bad.known().cuts == (("D", 8),)
 
 
+def test_two_blocks_that_fall_silent_in_turn_are_both_found_and_a_reload_forgets_none() -> None:
+    """Each fall counted for the last block alone, and a reload began the count again."""
+    old, new, other = words(0, 100), words(0, 100), words(0)
+    one, two = old.blocks
+    for block in (one, two):
+        old.bad_addresses.fell_silent(block)
+        assert not old.bad_addresses.is_suspect(block.span)
+    new.take_over(old)
+    other.take_over(old)
+    for block in (one, two):
+        new.bad_addresses.fell_silent(block)
+        assert new.bad_addresses.is_suspect(block.span)
+        new.bad_addresses.read(block)
+        new.bad_addresses.fell_silent(block)
+        assert not new.bad_addresses.is_suspect(block.span)
+        new.bad_addresses.read(block)
+    assert new.bad_addresses.clear
+    other.bad_addresses.read(one)
+    assert other.bad_addresses.clear  # it has no block of D100
+
+
 def test_a_changed_device_goes_on_with_the_searches_of_the_one_before() -> None:
     old, new, other = words(*range(16)), words(*range(16)), words(*range(8))
     (whole,) = old.blocks
