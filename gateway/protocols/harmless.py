@@ -14,6 +14,7 @@ from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span
 MOST_UNITS, MOST_FORMS = 64, 6  # of one read; of the reads in one place
 PROOF_FORM = 9  # the form that resyncs do not use otherwise
 MOST_EARLIER = 16  # resyncs before this one
+ENDS_FOR = 8  # resyncs that read one end of a place, until they read the other one
 # The form of the reply to a read, such as its number of bytes; None: it cannot be read.
 FormOf = Callable[[Span], Hashable | None]
 
@@ -69,15 +70,23 @@ class HarmlessReads:
     spans: Sequence[Span]
     outstanding: Span | None
     form: FormOf
+    numbered: bool = False  # a reply names its request: its form may be that of the outstanding one
     _places: list[tuple[Sequence[Span], Sequence[Span]]] = field(init=False)
 
     def __post_init__(self) -> None:
-        late = None if self.outstanding is None else self.form(self.outstanding)
-        places = (_place(self.form, span, late) for span in self.spans)
+        outstanding = self.outstanding
+        late = None if outstanding is None or self.numbered else self.form(outstanding)
+        places = (_place(self.form, span, late, outstanding) for span in self.spans)
         self._places = [place for place in places if place[0]]
 
     def __bool__(self) -> bool:
         return bool(self._places)
+
+    @property
+    def are_beside(self) -> bool:
+        """True if one of them leaves out the outstanding read."""
+        reads = (read for place in self._places for reads in place for read in reads)
+        return any(not overlap(read, self.outstanding) for read in reads)
 
     def pick(self, token: int) -> Span:
         """Returns the read of a token, which grows by two from one resync to the next.
@@ -86,11 +95,12 @@ class HarmlessReads:
         where it ends: a bad address must not hide the device for long.
         """
         (first, *others), (step, second) = self._places, divmod(token, 2)
-        turn = step // 2 if others else step
-        if step % 2 and others:
-            turn, place = divmod(turn, len(others))
-            first = others[place]
-        reads = first[turn % 2]
+        end = step
+        if others:
+            end += step // ENDS_FOR  # not in pairs: both places may be the same block
+            if step % 2:
+                first = others[step // 2 % len(others)]
+        reads = first[end % 2]
         return reads[(2 * step + second) % len(reads)]
 
     def proof(self, used: tuple[Hashable, ...] = ()) -> Span | None:
@@ -100,8 +110,14 @@ class HarmlessReads:
 
 # Each time-out of a device asks for the same reads again.
 @lru_cache(4096)
-def _place(form: FormOf, span: Span, late: Hashable) -> tuple[Sequence[Span], Sequence[Span]]:
-    """Returns the reads at the begin of the span, and those at its end."""
+def _place(
+    form: FormOf, span: Span, late: Hashable, outstanding: Span | None = None
+) -> tuple[Sequence[Span], Sequence[Span]]:
+    """Returns the reads at the begin of the span, and those at its end.
+
+    The device may be silent about an address of the `outstanding` read: they leave it out, if a
+    form is left without it.
+    """
     area, start, size = span
     begin: dict[Hashable, Span] = {}
     end: dict[Hashable, Span] = {}
@@ -113,7 +129,20 @@ def _place(form: FormOf, span: Span, late: Hashable) -> tuple[Sequence[Span], Se
                 found.setdefault(shape, read)
         if len(begin) == MOST_FORMS:
             break
-    return list(begin.values()), list((end or begin).values())
+    ends = list(begin.values()), list((end or begin).values())
+    beside = [[read for read in reads if not overlap(read, outstanding)] for reads in ends]
+    enough = [reads for reads in beside if reads]
+    return (enough[0], enough[-1]) if enough else ends
+
+
+def overlap(one: Span, other: Span | None) -> bool:
+    """Returns True if they have an address in common."""
+    return (
+        other is not None
+        and one.area == other.area
+        and one.start < other.start + other.size
+        and other.start < one.start + one.size
+    )
 
 
 @lru_cache(1024)

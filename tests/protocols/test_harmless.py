@@ -1,5 +1,6 @@
 """Reads of a resync: inside the configured spans, and told from the outstanding requests."""
 
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, AnyDriver, Span
-from gateway.protocols.harmless import HarmlessReads
+from gateway.protocols.harmless import ENDS_FOR, HarmlessReads, overlap
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
@@ -151,3 +152,49 @@ async def test_a_vigor_resync_reads_m0_and_configured_addresses_in_turn() -> Non
     asked = [(await resynced(driver, None, t, [span]))[2][5:9] for t in (2, 4, 6, 8)]
     assert asked[1] == asked[3] == b"0080"
     assert b"0080" not in (asked[0], asked[2])
+
+
+def registers(request: bytes) -> range:
+    first, count = int.from_bytes(request[2:4]), int.from_bytes(request[4:6])
+    return range(first, first + count)
+
+
+@pytest.mark.parametrize("outstanding", [Span("holding", 100, 2), Span("holding", 103, 2)])
+@pytest.mark.parametrize("numbered", [False, True])
+def test_a_resync_leaves_out_the_read_that_had_no_reply(
+    outstanding: Span, *, numbered: bool
+) -> None:
+    """The device may be silent about an address of it, at either end of the block."""
+    block = Span("holding", 100, 5)
+    reads = HarmlessReads([block, block], outstanding, DRIVERS[0].reply_shape, numbered)
+    assert reads.are_beside
+    for token in range(2, 40):
+        assert not overlap(reads.pick(token), outstanding)
+
+
+def test_two_resyncs_in_a_row_do_not_read_the_same_end_of_a_block() -> None:
+    block = Span("holding", 100, 120)
+    reads = HarmlessReads([block, block], block, DRIVERS[0].reply_shape)
+    at_begin = [reads.pick(token).start == 100 for token in range(2, 80, 2)]
+    repeated = [one for one, other in pairwise(at_begin) if one is other]
+    assert len(repeated) <= len(at_begin) // ENDS_FOR
+    assert {at_begin[n] for n in range(0, len(at_begin), 2)} == {False, True}
+
+
+async def test_nothing_near_a_register_is_read_that_is_known_as_bad() -> None:
+    driver, bad = DRIVERS[0], Span("holding", 300, 1)
+    spans = [Span("holding", n, 1) for n in (100, 200)]
+    for token in range(2, 40):
+        _, _, sent = await resynced(driver, bad, token, spans)
+        assert 300 not in registers(sent)
+
+
+async def test_of_two_registers_every_second_resync_leaves_out_the_silent_one() -> None:
+    """No other read has another length; that of the good one is not told from the silent one."""
+    driver, silent = DRIVERS[0], Span("holding", 101, 1)
+    spans = [Span("holding", 100, 1), Span("holding", 100, 2)]
+    found = [await resynced(driver, silent, token, spans) for token in (2, 4, 6, 8)]
+    beside = [101 not in registers(sent) for _, _, sent in found]
+    assert sorted(beside) == [False, False, True, True]
+    assert beside[0] is not beside[1]
+    assert [told > 0 for told, _, _ in found] == [not one for one in beside]

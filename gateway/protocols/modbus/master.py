@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Refused, Took
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span, Talk, Unit
-from gateway.protocols.harmless import HarmlessReads, resync_by_reads
+from gateway.protocols.harmless import HarmlessReads, overlap, resync_by_reads
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Place
 from gateway.protocols.modbus.frame import Frame, answer_length
@@ -213,19 +213,21 @@ class Master(Settings):
         self, outstanding: Span | None, spans: Sequence[Span]
     ) -> Callable[[int], Span]:
         """Returns the read of each probe token."""
-        if inside := HarmlessReads(spans, None if self.numbered else outstanding, self.reply_shape):
+        inside = HarmlessReads(spans, outstanding, self.reply_shape, self.numbered)
+        # The device may be silent about the outstanding address: the others are asked first. One
+        # that is not in the spans is known as bad, or was written: nothing near it is read.
+        alike = [span for span in spans if not overlap(span, outstanding)]
+        if inside and (inside.are_beside or not alike):
             return lambda token: (inside.proof() if token == PROOF else None) or inside.pick(token)
-        beyond = self._harmless(outstanding)
-        # The device may be silent about the outstanding address: the others are asked first.
-        alike = [span for span in spans if span != outstanding]
-        if spans and outstanding is not None:
+        beyond = self._harmless(spans[0] if spans and outstanding not in spans else outstanding)
+        if outstanding is not None and outstanding in spans:
             alike.append(outstanding)
 
         def pick(token: int) -> Span:
             step, second = divmod(token, 2)
             if alike and step % 2:
                 return alike[(step // 2 + second) % len(alike)]
-            return beyond[token % len(beyond)]
+            return inside.pick(token) if inside else beyond[token % len(beyond)]
 
         return pick
 
