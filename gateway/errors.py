@@ -173,6 +173,7 @@ class Evidence(StrEnum):
     SHAPE = "shape"  # a good frame that answers another request
     TRUNCATED = "truncated"  # a frame without its end
     SLOW = "slow"  # the right reply, after the time-out
+    REFUSAL = "refusal"  # a good frame that refuses another request than was sent
 
 
 class Diagnosis(NamedTuple):
@@ -205,6 +206,16 @@ class Garbled(Unclear):
         super().__init__(message)
         self.data = data[:64]
         self.evidence = evidence
+
+
+class RefusedOther(Garbled):
+    """An error reply that names another request. Some devices refuse every request so; it may also
+    be that to another master. `code`: as in `Refused`.
+    """
+
+    def __init__(self, message: str, data: bytes, *, code: str) -> None:
+        super().__init__(message, data, evidence=Evidence.REFUSAL)
+        self.code = code
 
 
 class Unsteady(Garbled):

@@ -15,6 +15,7 @@ _KINDS = {
     "truncated": "half a frame",
     "echo": "an echo only",
     "slow": "a late reply",
+    "refusal": "a refusal of another request",
 }
 Document = Mapping[str, Any]
 Named = tuple[str, Document]

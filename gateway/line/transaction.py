@@ -12,7 +12,7 @@ from gateway.engine.jobs.jobs import Settled, Traffic
 from gateway.errors import Busy, DeviceError, Evidence, Garbled, LineDown
 from gateway.line.channel import NEVER, SHORTEST_REPLY, Channel
 from gateway.line.timed_out import LateReply, verdict
-from gateway.protocols.capabilities import UnnumberedReplies
+from gateway.protocols.capabilities import LooseRefusals, UnnumberedReplies
 from gateway.protocols.driver import Codec, EndedByGap
 
 T = TypeVar("T")
@@ -280,6 +280,8 @@ class Transaction:
         if self._takes_late(frame):
             self._stray = self._stray or Evidence.SLOW
             return
+        if self._refuses_otherwise(frame):
+            return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
         number = _number(frame)
@@ -295,6 +297,19 @@ class Transaction:
                 self.traffic.contradicted |= self._contradicts(frame)
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
+
+    def _refuses_otherwise(self, frame: Any) -> bool:
+        """Ends the open request with an error reply that names another one.
+
+        It is no extra reply: if it is that to another master, the own one still arrives."""
+        driver = self._device.settings.driver
+        waiting = [request for request in self._open if not request.future.done()]
+        if len(waiting) != 1 or not isinstance(driver, LooseRefusals):
+            return False
+        if (error := driver.refusal_of_another(frame)) is None:
+            return False
+        _fail(waiting[0], error)
+        return True
 
     def _may_be_reply(self, frame: Any) -> bool:
         """Returns False for a frame that the device sends by itself, such as an on-demand block."""

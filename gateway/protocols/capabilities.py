@@ -7,6 +7,7 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
+from gateway.errors import RefusedOther
 from gateway.protocols.driver import Cost, Span, Talk
 
 F = TypeVar("F")
@@ -87,6 +88,14 @@ class StrayFrames(Protocol):
 
     def describe_stray(self, frame: Any) -> str | None:
         """Returns a phrase for the log; None for a frame that needs no explanation."""
+
+
+@runtime_checkable
+class LooseRefusals(Protocol):
+    """A driver whose error replies name a request, and some devices name the wrong one."""
+
+    def refusal_of_another(self, frame: Any) -> RefusedOther | None:
+        """Returns an error reply of this station, to another request than was sent, as an error."""
 
 
 @runtime_checkable

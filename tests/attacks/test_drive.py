@@ -26,6 +26,7 @@ class Drive(Slave):
     """Writes above `MOST` are limited. `refuses`: the exception to every write."""
 
     refuses: int | None = None
+    named: int = 6  # the function that the exception names
     echoes: bool = False  # from the next write on it is off, and the adapter returns what is sent
     _off: bool = False
     held: dict[int, int] = field(default_factory=dict)
@@ -37,7 +38,7 @@ class Drive(Slave):
         if request[1] != 6:
             return super()._reply(request)
         if self.refuses is not None:
-            reply = bytes((1, 0x86, self.refuses))
+            reply = bytes((1, 0x80 | self.named, self.refuses))
             return reply + crc(reply)
         number, value = int.from_bytes(request[2:4]), int.from_bytes(request[4:6])
         self.held[number] = min(value, MOST)
@@ -133,6 +134,24 @@ async def test_the_code_of_a_device_that_refuses_everything_is_the_answer(
             assert outcome.code == f"{code:02X}"
         with suppress(IndexError):
             assert "two" not in line.engine.devices[0].diagnosis()
+
+
+async def test_a_write_refused_with_the_code_of_another_function_is_unclear_and_values_stay_good(
+    tmp_path: Path,
+) -> None:
+    """All tags turned bad, and a second master was blamed."""
+    drive = Drive(lambda n: n in (10, 11), refuses=2, named=3)
+    tags: dict[int, dict[str, Any]] = {10: {}, 11: {"write": True}}
+    tags = {n: {**settings, "every": "1h"} for n, settings in tags.items()}  # writes go first
+    async with running(drive, tmp_path, tags) as (line, watch):
+        await watch.until(lambda: watch.good == {10, 11})
+        for value in (5, 6, 7):
+            outcome = await written(line, 11, value)
+            assert isinstance(outcome, Unclear)
+            assert str(outcome) == "exception 02 to function 03, which was not sent"
+            assert watch.good == {10, 11}
+        [device] = line.engine.devices
+        assert not device.is_doubtful
 
 
 @pytest.mark.parametrize("echoes", [False, True])

@@ -9,6 +9,9 @@ import pytest
 
 from gateway.config import LineConfig, built
 from gateway.plant.plant import Plant
+from gateway.protocols.modbus import rtu
+from gateway.protocols.modbus.ascii import AsciiCodec
+from gateway.protocols.modbus.frame import Frame
 from gateway.tags import Quality
 from tests.line.slaves import station_of
 from tests.sim.bench import Bench
@@ -121,6 +124,38 @@ async def test_a_silent_register_at_one_end_of_the_only_block_costs_its_tag_alon
     good = await looked_at(plant, after=120, looks=60)
     assert good.pop(SILENT) == 0
     assert min(good.values()) >= 50, good
+
+
+class Confused(Partly):
+    """A slave that refuses the register with an exception to function 04, whatever was sent."""
+
+    def hear(self, data: bytes, at: float) -> list[bytes]:
+        if not self._meant(data):
+            return super().hear(data, at)
+        pdu = bytes((0x84, 2))
+        match self.framing:
+            case "modbus-rtu":
+                return [rtu.encode(Frame(data[0], pdu))]
+            case "modbus-ascii":
+                return [AsciiCodec().encode(Frame(int(data[1:3], 16), pdu))]
+        return [data[:4] + bytes((0, 3, data[6])) + pdu]
+
+
+@pytest.mark.parametrize("retries", [0, 1, 2])
+@pytest.mark.parametrize("protocol", ["modbus-rtu", "modbus-ascii", "modbus-tcp"])
+@on_virtual_time
+async def test_a_register_refused_with_the_code_of_another_function_costs_its_tag_alone(
+    protocol: str, retries: int
+) -> None:
+    """All tags were bad for most of the time, and a second master was blamed."""
+    plant = plant_of(protocol, retries, Confused)
+    good = await looked_at(plant, after=30, looks=120)
+    assert good.pop(SILENT) == 0
+    assert min(good.values()) >= 115, good
+    [device] = plant.lines[0].engine.devices
+    [bad] = device.bad_addresses.bad.values()
+    assert bad.how == "refused with 02"
+    assert not device.is_doubtful
 
 
 class Bridge(Partly):

@@ -130,6 +130,23 @@ def test_verify_reads_refuses_two_reads_that_differ() -> None:
     assert plc.commands == ["WR", "WR"]
 
 
+@pytest.mark.parametrize("before", [0, 2])
+def test_verify_reads_looks_at_tags_alone(before: int) -> None:
+    """Registers between them and around them change: the tags of the block were never good."""
+    plc, count = Plc(verify_reads=2), iter(range(100))
+    plc.station.memory.write("D", 10, [7, 0, 9])
+    plc.station.memory.animate("D", 11, lambda now: next(count))
+    plc.station.memory.animate("D", 9, lambda now: next(count))
+    tags = (tag("D10"), tag("D12"))
+    block = Block(Span("D", 10, 3), 1.0, tags, Cost(0, 0))
+    poll = Poll(plc.device, block, Span("D", 10 - before, 3 + before))
+    units = plc.perform(poll)
+    assert isinstance(units, list)
+    assert [units[before], units[before + 2]] == [7, 9]
+    plc.station.memory.animate("D", 12, lambda now: next(count))
+    assert isinstance(plc.perform(poll), Unsteady)
+
+
 def test_verify_reads_registers_a_monitor_list_once() -> None:
     plc = Plc(verify_reads=3)
     assert plc.perform(plc.poll("D0", "D500", listed=True, register=True)) == [0, 0]

@@ -245,7 +245,6 @@ def test_vigor_holes_belong_to_no_area() -> None:
         (1, pdu("modbus-rtu-041")),  # function 04
         (1, bytes((3, 2)) + bytes(2)),  # one register instead of two: a late answer
         (1, bytes((3, 6)) + bytes(6)),
-        (1, bytes((0x84, 2))),  # an exception to another function
         (1, pdu("modbus-rtu-001")),  # the question itself
     ],
 )
@@ -259,6 +258,22 @@ async def test_only_the_requested_station_function_and_byte_count_are_accepted(
         await driver.read(hearing(driver, [wrong]), Span("holding", 0, 2))
     talk = hearing(kind(station=1), [wrong, right])
     assert list(await kind(station=1).read(talk, Span("holding", 0, 2))) == [0, 0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_an_exception_to_another_function_is_a_refusal_where_its_number_names_the_request(
+    kind: type,
+) -> None:
+    driver = kind(station=1)
+    refusal = Frame(1, bytes((0x84, 2)))
+    talk = hearing(driver, [framed(kind, 1, refusal.pdu)])
+    with pytest.raises(Refused if kind is ModbusTcp else NoReply):
+        await driver.read(talk, Span("holding", 0, 2))
+    error = driver.refusal_of_another(refusal)
+    assert str(error) == "exception 02 to function 04, which was not sent"
+    assert error.code == "02"
+    assert driver.refusal_of_another(Frame(2, refusal.pdu)) is None
+    assert driver.refusal_of_another(Frame(1, bytes((4, 2)))) is None
 
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])

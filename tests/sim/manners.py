@@ -116,12 +116,17 @@ def is_unknown(inner: Station, reply: bytes) -> bool:
     return False
 
 
+_OTHER_READ = {3: 4, 4: 3}
+
+
 def refusal(inner: Station, reply: bytes, code: str) -> bytes:
     """Returns the refusal with this code in place of the reply."""
     match inner:
         case ModbusStation():
             station, number, pdu = _parts(inner, reply)
-            said = bytes((pdu[0] | 0x80, int(code, 16)))
+            confused = station % 4 == 3  # it names function 04 for 03, and 03 for 04
+            function = _OTHER_READ.get(pdu[0], pdu[0]) if confused else pdu[0]
+            said = bytes((function | 0x80, int(code, 16)))
             return inner._codec.encode(Frame(station, said, number))  # private: its framing
         case VigorStation():
             return encode(Reply(inner.station, reply[3:5].decode("latin-1"), code, b""))

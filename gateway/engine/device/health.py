@@ -353,5 +353,7 @@ _ADVICE = {
     Evidence.STATION: "Another station replied: check the station numbers",
     Evidence.SHAPE: "The reply belongs to another request, or has another format",
     Evidence.SLOW: "The device replies too late: raise reply_timeout",
+    Evidence.REFUSAL: "It refuses with the code of another request: a fault of the device, or "
+    "another master is on the line",
     Evidence.TRUNCATED: "Replies break off: noise, or a device server that cuts packets",
 }

@@ -38,6 +38,7 @@ from gateway.errors import (
     LineDown,
     NoReply,
     Refused,
+    RefusedOther,
     Unclear,
     Unsteady,
 )
@@ -235,7 +236,7 @@ class NextJob:
         took = now - self._in_flight.begun
         failed = self._in_flight.failed  # in the same transaction
         alone = len(failed) == 1
-        suspect = _suspect(after, alone=alone)
+        suspect = _suspect(after, settle.error, alone=alone)
         self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )
@@ -281,9 +282,9 @@ def _leave_second(probe: Probe, now: float) -> None:
         leave_second(probe.device, probe.outstanding, probe.token, now)
 
 
-def _suspect(job: Unfinished, *, alone: bool) -> int:
+def _suspect(job: Unfinished, error: DeviceError, *, alone: bool) -> int:
     """Returns how many failures in a row a silent address may explain: the poll of a block that
-    has it, and a resync near that block."""
+    has it, and a resync near that block. A refusal, whatever it names, is no silence."""
     match job:
         case Poll(block=block):
             longer = job.span is not block.span
@@ -291,7 +292,7 @@ def _suspect(job: Unfinished, *, alone: bool) -> int:
         case Probe(outstanding=outstanding):
             return 2 * job.device.bad_addresses.is_suspect(outstanding)
         case _:
-            return int(isinstance(job, Identify))
+            return int(isinstance(job, Identify) or isinstance(error, RefusedOther))
 
 
 def _is_short(job: Unfinished) -> bool:

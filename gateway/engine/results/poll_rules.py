@@ -20,6 +20,7 @@ from gateway.errors import (
     GatewayError,
     Refusal,
     Refused,
+    RefusedOther,
     Unsteady,
     log_fields,
 )
@@ -252,6 +253,8 @@ class PollRules:
         lasting = others_answered and (known or half or poll.missed > 0)
         of_others = isinstance(error, Garbled) and error.evidence in OF_OTHERS
         code = DAMAGED if isinstance(error, Garbled) else SILENT
+        if isinstance(error, RefusedOther):
+            code = error.code
         if lasting and poll.block.listed and code == SILENT and poll.missed >= LIST_MISSED:
             self._plan_without_list(poll.device, error, now)
             return

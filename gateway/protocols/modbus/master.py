@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from itertools import count, repeat
 from typing import Any, NamedTuple, TypeVar
 
-from gateway.errors import BadValue, Refused, Took
+from gateway.errors import BadValue, Refused, RefusedOther, Took
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span, Talk, Unit
 from gateway.protocols.harmless import HarmlessReads, overlap, resync_by_reads
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Place
-from gateway.protocols.modbus.frame import Frame, answer_length
+from gateway.protocols.modbus.frame import EXCEPTION, Frame, answer_length
 from gateway.protocols.modbus.identity import NAMES, identify
 from gateway.protocols.modbus.settings import Settings
 from gateway.protocols.modbus.traffic import Read
@@ -64,7 +64,7 @@ class Master(Settings):
                 return None
             if len(heard) == length and heard[:2] == head:
                 return () if heard == request and not self.numbered else units(heard)
-            pdu.raise_refusal(heard, function)
+            pdu.raise_refusal(heard, function, numbered=self.numbered)
             return None
 
         said = await talk.ask(Frame(station, request, number), chars, answers)
@@ -151,7 +151,7 @@ class Master(Settings):
                 return True
             if request[0] == 6 and heard.pdu[:3] == request[:3] and len(heard.pdu) == 5:
                 raise Took([int.from_bytes(heard.pdu[3:])])
-            pdu.raise_refusal(heard.pdu, request[0])
+            pdu.raise_refusal(heard.pdu, request[0], numbered=self.numbered)
             return None
 
         return await talk.ask(frame, self.chars(length), answers)
@@ -263,6 +263,15 @@ class Master(Settings):
     def is_reply(self, frame: Frame) -> bool:
         return isinstance(frame, Frame) and frame.station == self.station
 
+    def refusal_of_another(self, frame: Frame) -> RefusedOther | None:
+        """An exception whose function is not that of the request."""
+        heard = frame.pdu
+        if frame.station != self.station or len(heard) != 2 or heard[0] < EXCEPTION:
+            return None
+        code, function = f"{heard[1]:02X}", heard[0] - EXCEPTION
+        why = f"exception {code} to function {function:02d}, which was not sent"
+        return RefusedOther(why, heard, code=code)
+
     def reply_shape(self, span: Span) -> Hashable:
         """Function and length: a reply to a read names no address."""
         cost, place = self.cost(span), self.place_of(span)
@@ -305,7 +314,7 @@ class Master(Settings):
                 return None
             if (found := accept(heard.pdu)) is not None:
                 return found
-            pdu.raise_refusal(heard.pdu, request[0])
+            pdu.raise_refusal(heard.pdu, request[0], numbered=self.numbered)
             return None
 
         return await talk.ask(Frame(self.station, request, number), self.chars(longest), answers)

@@ -142,14 +142,18 @@ _NOT_DONE = (1, 2, 3, 6, 10)  # exceptions without any effect
 _UNEXECUTED = (1, 6, 10)
 
 
-def raise_refusal(pdu: bytes, function: int) -> None:
+def raise_refusal(pdu: bytes, function: int, *, numbered: bool = False) -> None:
     """Raises the error of an exception reply to `function`; ignores other PDUs.
+
+    `numbered`: its number names the request, so the function that it names does not count.
 
     `Refused` with the exception code in hex; `NoReply` for 0B, from a gateway whose device did
     not reply: a write may have been done. `Unclear` for 05 to a write, which was accepted and
     may be done later, and for every other exception to a write after which part may be done.
     """
-    if len(pdu) != 2 or pdu[0] != function | EXCEPTION:
+    if len(pdu) != 2 or not pdu[0] & EXCEPTION:
+        return
+    if pdu[0] != function | EXCEPTION and not numbered:
         return
     code = pdu[1]
     if code == _NO_RESPONSE_BEHIND:
