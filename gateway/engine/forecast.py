@@ -6,15 +6,20 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from gateway.engine.device.ages import load_of, polled_blocks, worst_ages
-from gateway.engine.device.device import Device
+from gateway.engine.device.device import PROOF_COST, Device
 from gateway.engine.device.long_writes import long_write
+from gateway.engine.device.probe_pace import PAUSE_FIRST, PROBE_PAUSE
 from gateway.engine.device.reply_shapes import MARK_LONGEST
 from gateway.engine.schedule.probes import seen_within
-from gateway.planning.planner import Block, shortest_round
+from gateway.planning.planner import Block, items_of, shortest_round
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
+
+# Times that a device goes offline within a search: resyncs may read the silent address, too. Not
+# more were seen in simulated searches with drawn blocks, retries, intervals and time-outs.
+SEARCH_FALLS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +112,28 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
         unsolicited=tuple((device, tags) for device, tags in unsolicited if tags),
     )
+
+
+def dark_for(device: Device, load: float) -> float | None:
+    """Returns the seconds for which one address without replies darkens other tags, at most.
+
+    Its block is halved until the address is alone. None: its requests cannot be halved, or the line
+    has no time left. `load`: of the line.
+    """
+    blocks = [block for block in device.blocks if not (block.of_fields or block.listed)]
+    if load >= 1 or not blocks or len(blocks) < len(device.blocks):
+        return None
+    longer, retries = int(device.shapes is not None), device.timing.retries
+    resync = device.seconds(PROOF_COST)
+
+    def search(block: Block) -> float:
+        levels = (len(items_of(block.tags)) - 1).bit_length()
+        reads = 2 + retries + 2 * longer + levels * (1 + min(1, retries) + longer)
+        waits = block.every + max(block.every, PAUSE_FIRST)
+        return waits + reads * (device.longest_reply + device.seconds(block.cost) + resync)
+
+    falls = SEARCH_FALLS * (PROBE_PAUSE + 2 * device.longest_reply)
+    return (max(map(search, blocks)) + falls) / (1 - load)
 
 
 def _marks(device: Device) -> float:

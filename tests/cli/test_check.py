@@ -25,6 +25,7 @@ def test_check_prints_the_plan(command: Command, config: Path) -> None:
     assert "a silent station that returns is seen within" in done.out
     rows = [line.split() for line in done.out.splitlines() if line.startswith("  mixer")]
     assert "Y20" in [row[1] for row in rows]
+    assert re.search(r"  mixer: one address without replies darkens others for [\d.]+ s", done.out)
     assert f"{config}: good, 7 tags on 1 line" in done.out
     assert "writing mixer/valve (D7.3) reads the word" in done.err
     assert "warning" not in done.err

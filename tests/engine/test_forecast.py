@@ -15,7 +15,7 @@ import pytest
 from gateway.config import load
 from gateway.engine.device.device import Device
 from gateway.engine.device.reply_shapes import MARK_LONGEST
-from gateway.engine.forecast import LineForecast, forecast
+from gateway.engine.forecast import LineForecast, dark_for, forecast
 from gateway.parts.transfers.forecast import forecasts
 from gateway.planning.planner import shortest_round
 from gateway.planning.wire_timing import WireTiming
@@ -203,3 +203,14 @@ def test_a_round_is_planned_only_where_it_can_differ(
     if line.overloaded:
         one = device([replace(tag, every=1.0) for tag in tags])
         assert line.shortest == pytest.approx(sum(one.seconds(block.cost) for block in one.blocks))
+
+
+def test_a_search_for_a_silent_address_takes_time_outs_for_each_half() -> None:
+    """The line's other polls take their share of the time. A full line has none left."""
+    one, many = device(words(0, 1)), device(words(0, 60))
+    found = {dev: dark_for(dev, 0.0) for dev in (one, many)}
+    reads = (found[many] or 0.0) - (found[one] or 0.0)
+    halves = 6 * 3  # each alone, once longer, and again
+    assert halves * many.longest_reply < reads < halves * (many.longest_reply + 0.3)
+    assert dark_for(many, 0.5) == 2 * (found[many] or 0.0)
+    assert dark_for(many, 1.0) is None

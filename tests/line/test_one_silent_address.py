@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.config import LineConfig, built
+from gateway.engine.forecast import dark_for
 from gateway.plant.plant import Plant
 from gateway.protocols.modbus import rtu
 from gateway.protocols.modbus.ascii import AsciiCodec
@@ -121,7 +122,10 @@ async def test_a_silent_register_at_one_end_of_the_only_block_costs_its_tag_alon
 ) -> None:
     """Resyncs read at that end too, so the device went offline within each search: it was dark."""
     plant = plant_of(protocol, retries, FallsSilent, numbers=block)
-    good = await looked_at(plant, after=120, looks=60)
+    [device] = plant.lines[0].engine.devices
+    dark = dark_for(device, device.load)  # as `check` says
+    assert dark is not None
+    good = await looked_at(plant, after=60 + dark, looks=60)
     assert good.pop(SILENT) == 0
     assert min(good.values()) >= 50, good
 

@@ -244,6 +244,7 @@ def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
         parts.append(_line(line))
         if every_block and (line.blocks or line.unsolicited):
             parts.append(_blocks(line))
+            parts.extend(map(Text, _dark(line)))
         parts.append(Text())
     return Group(*parts)
 
@@ -274,6 +275,14 @@ def _proven(line: LineForecast) -> str:
     if line.load_proven == line.load:  # all replies carry a number
         return ""
     return f"\n  load {line.load_proven:.1%} after an extra reply: each read is proven then"
+
+
+def _dark(line: LineForecast) -> Iterator[str]:
+    """Yields what one silent address costs each device."""
+    for device in dict.fromkeys(row.device for row in line.blocks):
+        if (time := dark_for(device, line.load)) is not None:
+            name = device.name
+            yield f"  {name}: one address without replies darkens others for {seconds(time)} at most"
 
 
 def _blocks(line: LineForecast) -> Table:
