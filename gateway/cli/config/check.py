@@ -18,7 +18,7 @@ from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
 from gateway.config.loading import written
 from gateway.config.messages import dotted
-from gateway.engine.forecast import LineForecast, why_not_learned
+from gateway.engine.forecast import LineForecast, dark_for, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.parts.doors.plan import door_plans, door_warnings
 from gateway.parts.history.settings import HistorySection
@@ -281,8 +281,8 @@ def _dark(line: LineForecast) -> Iterator[str]:
     """Yields what one silent address costs each device."""
     for device in dict.fromkeys(row.device for row in line.blocks):
         if (time := dark_for(device, line.load)) is not None:
-            name = device.name
-            yield f"  {name}: one address without replies darkens others for {seconds(time)} at most"
+            most = f"{seconds(time)} at most"
+            yield f"  {device.name}: one address without replies darkens others for {most}"
 
 
 def _blocks(line: LineForecast) -> Table:
