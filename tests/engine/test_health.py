@@ -13,7 +13,13 @@ from gateway.engine.device.health import (
     State,
     diagnosis,
 )
-from gateway.engine.device.probe_pace import PAUSE_FIRST, PROBE_PAUSE
+from gateway.engine.device.probe_pace import (
+    HOPE_FOR,
+    PAUSE_ALIVE,
+    PAUSE_FIRST,
+    PAUSE_LATE,
+    PROBE_PAUSE,
+)
 from gateway.engine.schedule.probes import is_noisy
 from gateway.errors import NO_TROUBLE, Evidence, Garbled, GatewayError, LineDown, NoReply, Unclear
 from gateway.protocols.driver import Span
@@ -294,3 +300,39 @@ def test_the_diagnosis_of_silence_adds_the_causes_that_the_protocol_knows() -> N
 
 def test_other_trouble_is_its_own_diagnosis() -> None:
     assert diagnosis(LineDown("unplugged"), "other causes") == ("other", "unplugged")
+
+
+def test_a_station_of_which_all_replies_are_damaged_is_no_victim_of_noise() -> None:
+    probes, now = link_device().health.probes, 0.0
+    while probes.is_urgent(now) or not now:
+        probes.replied_damaged(now)
+        probes.grow(now, 1.0)
+        now += 1.0
+    assert now == HOPE_FOR
+    assert probes.pause == PAUSE_ALIVE
+    assert probes.is_alive(now)
+    probes.grow(now, 1.0)
+    assert probes.pause == PAUSE_FIRST
+    probes.replied()
+    probes.replied_damaged(now)
+    assert probes.is_urgent(now)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_station_that_is_later_than_its_time_out_is_probed_less_and_less(alone: bool) -> None:
+    """Each of its replies meets exchanges of others, if there are others."""
+    probes, now, pauses = link_device().health.probes, 0.0, []
+    for _ in range(30):
+        probes.sent(short=False)
+        probes.grow(now, 1.0)
+        probes.spoke(now + 0.5, 1.0, alone=alone)
+        pauses.append(probes.due - now)
+        now = probes.due + 1.0
+    assert pauses[0] <= PAUSE_FIRST
+    assert max(pauses) == pytest.approx(0.5 if alone else 0.5 + PAUSE_LATE)
+    probes.sent(short=False)
+    probes.replied()
+    probes.sent(short=True)
+    probes.grow(now, 1.0)
+    probes.spoke(now, 1.0)
+    assert probes.due == now

@@ -18,6 +18,7 @@ from gateway.engine.jobs.request_queue import MOST_WAITING
 from gateway.engine.jobs.requests import WRITE_EXPIRY, Write
 from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
+    ONE_OFFLINE,
     PATIENT_AFTER,
     SHORTEST,
     UNKNOWN,
@@ -371,6 +372,36 @@ def test_all_offline_devices_together_get_a_twentieth_while_others_are_online() 
                 schedule.polled(poll, now)
     assert 0.8 * OFFLINE_SHARE <= probing / now <= OFFLINE_SHARE
     assert probed == set(offline)  # in turn
+
+
+def test_a_long_probe_that_waits_for_its_share_holds_up_no_short_one_that_fits() -> None:
+    healthy, patient, offline = online(0, every=0.3), weighing_machine(), online(0, station=3)
+    schedule = Schedule([healthy, patient, offline], 0.0)
+    for dev in (patient, offline):
+        fail(dev)
+        schedule.went_offline(dev, 0.0, 0.5)
+    patient.health.probes.due = 0.0
+    polled(schedule, 5.0)
+    job = schedule.next(5.01)
+    assert isinstance(job, Probe)
+    assert (job.device, job.timeout) == (offline, UNKNOWN)
+
+
+def test_one_offline_unit_of_a_network_gets_less_than_all_together() -> None:
+    units = [
+        made_device(f"d{n}", driver, WIRE, driver.timing, [make_tag("holding:0", driver)])
+        for n in range(1, 6)
+        for driver in [ModbusTcp(station=n)]
+    ]
+    schedule = Schedule(units, 0.0)
+    units[0].health.answered()
+    for silent, dev in enumerate(units[1:], 1):
+        fail(dev)
+        schedule.went_offline(dev, 0.0, 0.5)
+        # Without idle time, a request is its next probe.
+        free = 0.5 / min(OFFLINE_SHARE, silent * ONE_OFFLINE) - 0.5
+        assert not schedule.reachable(dev, free - 0.1)
+        assert schedule.reachable(dev, free + 0.1)
 
 
 def test_offline_devices_get_all_the_time_while_none_is_online() -> None:

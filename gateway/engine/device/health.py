@@ -264,12 +264,12 @@ class Health:
             sent = self.unanswered.sent.popleft()
             self.probes.behind(now, now - sent, more=bool(self.unanswered.sent))
 
-    def spoke(self, now: float, longest_reply: float) -> None:
-        """Notes a sound frame, perhaps of an offline device."""
+    def spoke(self, now: float, longest_reply: float, *, alone: bool = False) -> None:
+        """Notes a sound frame, perhaps of an offline device. `alone`: no other one is online."""
         if self.unanswered.sent:
             self.probes.replied_behind(now, now - self.unanswered.sent[-1])
         if self.state is State.OFFLINE:
-            self.probes.spoke(now, longest_reply)
+            self.probes.spoke(now, longest_reply, alone=alone)
 
     @property
     def is_probed(self) -> bool:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
 PAUSE_ALIVE, ALIVE_FOR = 0.05, 10.0  # seconds: the pause, and since bytes arrived
+HOPE_FOR = 30.0  # seconds without a good reply after which damaged ones are no sign of noise
+PAUSE_LATE = 60.0  # the longest time between two probes of one that is later than `reply_timeout`
 LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is of use
 LATE_MOST = 1.0  # seconds by which a reply is known to be late, at most: another master may ask
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
@@ -24,9 +26,12 @@ class ProbePace:
     _behind_until: float = -math.inf  # until then a server has older requests to pass on
     _last: float = -math.inf  # of an offline device
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
+    _damaged_since: float = math.inf  # without a good one since
     _last_late: float = -math.inf  # a late reply, or one to an older request
     _late_by: float = 0.0  # seconds that a reply came behind the last request, at least
     _late_seen: float = -math.inf  # when it did
+    _waited: bool = False  # the last probe was a patient one,
+    _late_since: float = math.inf  # and since then each reply has come behind such a probe
 
     def restart(self) -> None:
         self.short = 0
@@ -40,9 +45,10 @@ class ProbePace:
 
     def replied(self) -> None:
         self.short, self.pause = 0, 0.0
+        self._damaged_since = self._late_since = math.inf
 
     def replied_damaged(self, now: float) -> None:
-        self._last_bytes = now
+        self._last_bytes, self._damaged_since = now, min(self._damaged_since, now)
 
     def replied_late(self, now: float) -> None:
         self._last_late = now
@@ -51,7 +57,7 @@ class ProbePace:
         """Doubles the pause before the next probe. It is short while damaged replies arrive: then
         the wire is the trouble."""
         self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
-        if self.is_alive(now):
+        if self.is_urgent(now):
             self.pause = PAUSE_ALIVE
         self.due = max(now + self.pause * spread, self._behind_until)
         self._last = now
@@ -63,6 +69,11 @@ class ProbePace:
     def is_alive(self, now: float) -> bool:
         """Returns True if damaged replies of the device arrived a short time ago."""
         return now - self._last_bytes < ALIVE_FOR
+
+    def is_urgent(self, now: float) -> bool:
+        """Returns True if it is alive, and the next reply may be good: a station of which all
+        replies are damaged is no victim of noise, and takes no more of the wire than a dead one."""
+        return self.is_alive(now) and now - self._damaged_since < HOPE_FOR
 
     def was_late(self, now: float) -> bool:
         """Returns True if a reply of the device came late in the last minute."""
@@ -79,11 +90,19 @@ class ProbePace:
         reply of the last minute was late; 0: none was."""
         return 2 * self._late_by if now - self._late_seen < LATE_FOR else 0.0
 
-    def spoke(self, now: float, longest_reply: float) -> None:
-        """Notes a sound frame while it was offline: it replies later than a short probe waits."""
+    def spoke(self, now: float, longest_reply: float, *, alone: bool = False) -> None:
+        """Notes a sound frame while it was offline: it replies later than the last probe waited.
+
+        Behind a patient probe it is later than `reply_timeout`. Each probe costs others that time,
+        and its reply meets their exchanges. `alone`: there are none.
+        """
         if self.patient:
             return
         self.patient = True
+        if self._waited and not alone:
+            self._late_since = min(self._late_since, now)
+            self.due = max(self.due, now + min(now - self._late_since, PAUSE_LATE))
+            return
         if now - self._last <= longest_reply:
             self.due = now
         self.soon()
@@ -100,5 +119,6 @@ class ProbePace:
     def sent(self, *, short: bool) -> None:
         """Counts a probe that is sent."""
         self.short = self.short + 1 if short else 0
+        self._waited = not short
         if not short:
             self.patient = False

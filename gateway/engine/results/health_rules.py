@@ -135,7 +135,8 @@ class HealthRules:
 
     def spoke(self, device: Device, now: float) -> None:
         """Applies a sound frame of a device, which no request waits for."""
-        device.health.spoke(now, device.longest_reply)
+        alone = not any(other.health.online for other in self._schedule.devices)
+        device.health.spoke(now, device.longest_reply, alone=alone)
 
     def answered_twice(self, device: Device, now: float, time: int) -> None:
         """Applies a reply to no request: values read just before may be those of other tags.

@@ -240,7 +240,7 @@ class NextJob:
         self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )
-        self._polls.fell_silent(settle)
+        self._polls.fell_silent(settle, now)
         for poll, error in failed:
             self._polls.unread(poll, error, now, time, alone=alone)
         if not isinstance(after, Poll | Probe):

@@ -31,6 +31,7 @@ from gateway.tags import Reason
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 # They say nothing of addresses.
 OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.SLOW, Evidence.ECHO)
+NOISY_ROUNDS = 4  # rounds without a reply that noise explains
 LIST_MISSED = 3  # rounds without a reply to the monitor list alone, until it is given up
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
@@ -214,12 +215,12 @@ class PollRules:
             device.monitor.allow()  # the bad address in the list may be known now
             self._replans.want(device, now)
 
-    def fell_silent(self, settle: Settle) -> None:
+    def fell_silent(self, settle: Settle, now: float) -> None:
         """Notes the block before a resync without a reply, after which the device is offline: the
-        resync may have read beside it."""
+        resync may have read beside it. Noise may have destroyed both replies."""
         device, after = settle.device, settle.after
         fell = settle.before is State.FAILING and device.health.state is State.OFFLINE
-        if not (fell and isinstance(after, Probe)):
+        if not (fell and isinstance(after, Probe)) or device.health.probes.is_alive(now):
             return
         for poll in self._schedule.polls(device):
             if poll.block.span == after.outstanding:
@@ -237,7 +238,8 @@ class PollRules:
         device, bad = poll.device, poll.device.bad_addresses
         health, retries = device.health, device.timing.retries
         if health.state is State.OFFLINE:
-            if alone and health.consecutive_failures <= 1:  # it replied to the request before
+            replied = health.consecutive_failures <= 1  # to the request before
+            if alone and replied and not health.probes.is_alive(now):
                 bad.went_silent(poll.block)
             return
         if poll.job.span is not poll.block.span and device.shapes is not None:
@@ -250,7 +252,9 @@ class PollRules:
             self._schedule.again(poll)
             return
         others_answered = health.consecutive_failures <= 1
-        lasting = others_answered and (known or half or poll.missed > 0)
+        # Noise may destroy several replies in a row to a block that was read before.
+        rounds = NOISY_ROUNDS if poll.reads.ever and health.probes.is_alive(now) else 0
+        lasting = others_answered and (known or half or poll.missed > rounds)
         of_others = isinstance(error, Garbled) and error.evidence in OF_OTHERS
         code = DAMAGED if isinstance(error, Garbled) else SILENT
         if isinstance(error, RefusedOther):

@@ -8,10 +8,10 @@ from gateway.engine.device.health import State
 from gateway.engine.device.probe_pace import PROBE_SPREAD
 from gateway.engine.jobs.jobs import Probe
 from gateway.engine.schedule.probes import (
-    OFFLINE_SHARE,
     PATIENT_AFTER,
     brief_timeout,
     is_noisy,
+    offline_share,
     order_of_start,
     probe_seconds,
     short_timeout,
@@ -74,15 +74,20 @@ class ProbeSchedule:
         offline = [device for device in others if device.health.state is State.OFFLINE]
         if not offline:
             return until
-        device = min(offline, key=lambda device: device.health.probes.due)
-        if device.health.probes.due > now:
-            return min(until, device.health.probes.due)
-        return self._offline(device, now, idle_until) or min(until, self._offline_lane)
+        for device in sorted(offline, key=lambda device: device.health.probes.due):
+            if device.health.probes.due > now:
+                until = min(until, device.health.probes.due)
+                break
+            # A long probe that waits for its share must not hold up a short one that fits.
+            if (probe := self._offline(device, now, idle_until)) is not None:
+                return probe
+            until = min(until, self._offline_lane)
+        return until
 
     def _offline(self, device: Device, now: float, idle_until: float) -> Probe | None:
         """Returns the probe that the wire has time for, if any."""
-        health, alive = device.health, device.health.probes.is_alive(now)
-        if alive:  # its damaged replies show that the wire is the trouble
+        health, urgent = device.health, device.health.probes.is_urgent(now)
+        if urgent:  # its damaged replies show that the wire is the trouble
             return self.probe(device, now) if idle_until > now or self.failing_lane <= now else None
         if idle_until <= now < self._offline_lane:
             return None
@@ -123,12 +128,14 @@ class ProbeSchedule:
     def went_offline(self, device: Device, now: float, took: float) -> None:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
         device.health.gave_up(now, self._random.uniform(1 - PROBE_SPREAD, 1 + PROBE_SPREAD))
-        if device.health.probes.is_alive(now):
+        if device.health.probes.is_urgent(now):
             self.failing_lane = now + took
             return
         if self._in_idle_time:
             return
-        self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if self._any_online else now
+        silent = [other.health.state for other in self._devices].count(State.OFFLINE)
+        share = offline_share(silent, over_network=device.driver.traits.over_network)
+        self._offline_lane = now + took * (1 / share - 1) if self._any_online else now
 
     @property
     def _any_online(self) -> bool:

@@ -12,6 +12,7 @@ SHORTEST = 0.05  # but at least so many seconds,
 UNKNOWN = 0.1  # and so many while no station of the protocol has replied
 CHARACTERS = 50  # of a probe and its reply, at most about
 OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together, beside idle time
+ONE_OFFLINE = 0.015  # of one behind a network: each of its probes waits for `reply_timeout`
 
 
 def order_of_start(device: Device) -> tuple[bool, bool]:
@@ -63,6 +64,11 @@ def is_noisy(device: Device, devices: Sequence[Device], now: float) -> bool:
     return device.health.probes.is_alive(now) and not late
 
 
+def offline_share(silent: int, *, over_network: bool) -> float:
+    """Returns the share of the wire time of so many offline devices, beside idle time."""
+    return min(OFFLINE_SHARE, silent * ONE_OFFLINE) if over_network else OFFLINE_SHARE
+
+
 def probe_seconds(device: Device, timeout: float | None = None) -> float:
     """Returns the seconds of an unanswered probe. `timeout` None: a patient one."""
     wait = device.timing.reply_timeout if timeout is None else timeout
@@ -97,7 +103,8 @@ def seen_within(
     count, times = len(answerable), [0.0]
     for silent in range(1, max(count, 2)):  # at least one replies, if there are several
         healthy = 1.0 - silent / count if count else 0.0
-        share = max(idle * (1.0 - healthy * (load + lost)), OFFLINE_SHARE)
+        least = offline_share(silent, over_network=not idle)
+        share = max(idle * (1.0 - healthy * (load + lost)), least)
         times.append((1.0 - healthy) * one_round / share)
     pause = PROBE_PAUSE * (1.0 + PROBE_SPREAD) + longest
     return pause + times[-1], pause + max(times)

@@ -43,7 +43,8 @@ class Schedule:
       just failed get half of the wire's time.
     * An offline device is probed at growing pauses, mostly by short probes. A probe uses idle time
       of the wire if it ends before the next poll is due, or takes no longer than the longest poll.
-      Otherwise all offline devices together get a twentieth of the wire's time.
+      Otherwise all offline devices together get a twentieth of the wire's time, one alone of a
+      network less.
     * A request to an offline device has it probed at once, when no poll is due.
     """
 
