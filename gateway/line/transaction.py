@@ -220,7 +220,13 @@ class Transaction:
         if codec.pending and all(request.future.done() for request in self._open):
             self.traffic.strange = True  # another frame begins behind the reply
         if gap := codec.gap_timeout:
-            self._gap = self._channel.loop.call_later(gap, self._take, codec.expire)
+            self._gap = self._channel.loop.call_later(gap, self._gap_ended, codec, gap)
+
+    def _gap_ended(self, codec: EndedByGap[Any], gap: float) -> None:
+        """Takes the frame that the silence ended, unless the loop stood still for too long."""
+        if self._open and self._open[0].until + gap <= self._channel.now():
+            self._expire()
+        self._take(codec.expire)
 
     def _spoiled_after(self) -> float | None:
         """Returns the silence after which a reply of full length is spoiled; None: it goes on.

@@ -9,11 +9,13 @@ import pytest
 from gateway.engine.jobs.jobs import Settled
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
 from gateway.protocols.driver import Span
+from gateway.protocols.frames import FrameDriver
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
 from tests.line.fake_port import SPAN, WIRE, EchoingPort, FakePort, opened, read
+from tests.protocols.frames_examples import load
 from tests.sim.virtual import VirtualLoop, now, on_virtual_time
 
 
@@ -373,3 +375,27 @@ async def test_a_reply_that_waited_while_the_loop_stood_still_is_late() -> None:
     with pytest.raises(NoReply):
         await asking
     assert (await talk.settle(0.5, 0.02)).late == 0.0
+
+
+@pytest.mark.parametrize("stood_still", [0.0, 3.0])
+@on_virtual_time
+async def test_a_silence_that_ends_a_reply_long_after_its_time_out_makes_it_late(
+    stood_still: float,
+) -> None:
+    """It was a value of now, three seconds old."""
+    ask = {"send": "W?", "match": "(?P<w>[0-9]{5})", "fields": {"w": {"type": "integer"}}}
+    scale = FrameDriver(load({"framing": {"gap": "50ms"}, "ask": {"w": ask}}))
+    port = FakePort()
+    port.after = lambda _: None
+    talk = opened(port, scale)
+    asking = asyncio.create_task(scale.read(talk, Span("ask w", 0, 1)))
+    await asyncio.sleep(0.01)
+    talk.received(b"00145")
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.pass_time(stood_still)
+    if stood_still:
+        with pytest.raises(Garbled):
+            await asking
+    else:
+        assert await asking == [145]

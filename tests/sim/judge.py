@@ -145,7 +145,8 @@ class Judge:
         """A reply that came after its time-out counts for nothing, also after a frozen loop."""
         device = next(d for d in bus.line.engine.devices if d.name == tag.device)
         serial = isinstance(bus.wire, SimWire)  # on TCP a reply has the number of its question
-        limit = device.timing.reply_timeout + SPOKEN
+        spoken = [device.seconds(block.cost) for block in device.blocks if tag in block.tags]
+        limit = device.timing.reply_timeout + max([SPOKEN, *spoken])
         if bus.proof:  # the loop may stand still between the reply and its proof
             limit += bus.proof + bus.stood_still(bus.proof)
         if serial and took > limit:

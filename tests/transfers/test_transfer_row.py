@@ -317,3 +317,17 @@ def test_a_filled_value_lapses_once_with_its_source_and_is_carried_again() -> No
         assert carried(other, 5, 1.0) is not None
         other.ended(DONE, 1.1)
         assert other.lapse(BAD) is None
+
+
+def test_the_age_of_the_source_is_looked_at_between_two_tries_of_a_write() -> None:
+    """The substitute was written up to 30 s before its time: it was that of the last try."""
+    one, now, stale = row(substitute=0, stale=20.0, every=1.0), 0.0, 20.0
+    while now < 60.0:
+        if one.next(good(5), now) is not None:
+            one.ended(NOT_DONE, now)
+        now = one.wake(now)
+    last = now
+    while (carry := one.next(BAD, now)) is None:
+        now = one.wake(now)
+    assert carry.substitute
+    assert now >= last + stale - 1.0

@@ -200,10 +200,10 @@ class TransferRow:
 
     def wake(self, now: float) -> float:
         """Returns the time of the next look, if the source does not change before."""
-        if now < self._retry.at:
-            return self._retry.at
         soon = now + min(LOOK_EVERY, self.rule.stale / _LOOKS)
         looks = self._wanted or self.rule.substitute is not None or self._fills
+        if now < self._retry.at:  # the age of the source counts meanwhile
+            return min(soon, self._retry.at) if looks else self._retry.at
         if self.rule.every is None:
             if self._wanted and now < self._next_change:
                 return min(soon, self._next_change)
