@@ -32,7 +32,7 @@ async def speak_now_and_then(
             judge.said(name, gadget)
         wire.speak(data, station)
         first = wire.chunk * character
-        whole = not (wire.hanging or station.junk)
+        whole = not (wire.hanging or station.junk or bus.keeps_replies(name))
         if gadget.wrapping.header and 0 < wire.chunk < len(data) and whole:
             until = loop.time() + len(data) * character
             loop.call_later(first + 1e-6, _begun, bus, until)
