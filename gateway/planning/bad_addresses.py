@@ -152,6 +152,10 @@ class BadAddresses:
         """Returns True for a block with an address about which the device may be silent."""
         return span in self.silenced or span in self.bad or span in self._leaves
 
+    def has_failed(self, span: Span) -> bool:
+        """Returns True for a block that no reply, or no good one, came to since it was read."""
+        return self.is_suspect(span) or span in self._fell
+
     def is_trial(self, span: Span) -> bool:
         """Returns True for a whole block that had to be split before: one refusal is enough."""
         return any(_is_inside(cut, (span,)) for cut in self._suspected)

@@ -26,6 +26,8 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 class Partly:
     """A slave that says nothing about one register."""
 
+    silent: tuple[int, ...] = (SILENT,)
+
     def __init__(self, inner: Any, framing: str) -> None:
         self.inner = inner
         self.framing = framing
@@ -40,7 +42,7 @@ class Partly:
     def _meant(self, data: bytes) -> bool:
         pdu = self.pdu_of(data)
         start, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
-        return pdu[0] == 3 and start <= SILENT < start + count
+        return pdu[0] == 3 and any(start <= n < start + count for n in self.silent)
 
     def pdu_of(self, data: bytes) -> bytes:
         match self.framing:
@@ -128,6 +130,20 @@ async def test_a_silent_register_at_one_end_of_the_only_block_costs_its_tag_alon
     good = await looked_at(plant, after=60 + dark, looks=60)
     assert good.pop(SILENT) == 0
     assert min(good.values()) >= 50, good
+
+
+@pytest.mark.parametrize("retries", [0, 1, 2])
+@pytest.mark.parametrize("silent", [(200, 300), (100, 200, 300), (300, 400, 500), (100, 300, 500)])
+@on_virtual_time
+async def test_several_silent_registers_among_five_single_ones_cost_their_tags_alone(
+    silent: tuple[int, ...], retries: int
+) -> None:
+    """The first one was asked first whenever the device came online, so nothing was ever read."""
+    kind: type[Partly] = type("SilentAboutSome", (Partly,), {"silent": silent})
+    plant = plant_of("modbus-rtu", retries, kind)
+    good = await looked_at(plant, after=300, looks=90)
+    assert {good.pop(n) for n in silent} == {0}
+    assert min(good.values()) >= 60, good
 
 
 class Confused(Partly):

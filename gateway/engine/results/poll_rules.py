@@ -24,7 +24,7 @@ from gateway.errors import (
     Unsteady,
     log_fields,
 )
-from gateway.planning.bad_addresses import DAMAGED, RETRIES, SILENT
+from gateway.planning.bad_addresses import DAMAGED, RETRIES, SILENT, within
 from gateway.planning.planner import Block, describe
 from gateway.tags import Reason
 
@@ -220,10 +220,11 @@ class PollRules:
         resync may have read beside it. Noise may have destroyed both replies."""
         device, after = settle.device, settle.after
         fell = settle.before is State.FAILING and device.health.state is State.OFFLINE
-        if not (fell and isinstance(after, Probe)) or device.health.probes.is_alive(now):
+        read = after.outstanding if fell and isinstance(after, Probe) else None
+        if read is None or device.health.probes.is_alive(now):
             return
         for poll in self._schedule.polls(device):
-            if poll.block.span == after.outstanding:
+            if within(poll.block.span, read):  # it may have been read with more addresses
                 device.bad_addresses.fell_silent(poll.block)
 
     def unread(

@@ -358,8 +358,13 @@ class Schedule:
         for poll in self._polls[device]:
             poll.came_online(now)
         self.plan(device, now)
-        for poll in self._polls[device]:
+        polls, bad = self._polls[device], device.bad_addresses
+        for poll in polls:
             poll.spread()
+        # What the device is silent about would end it again, before anything is read.
+        sound = [poll for poll in polls if not bad.has_failed(poll.block.span)]
+        if sound and len(sound) < len(polls):
+            self.expedite(sound[0])
 
     def opened(self, now: float) -> None:
         """Starts again after the line was opened."""
