@@ -4,7 +4,7 @@ A device may be silent about addresses that it lacks. So a resync reads inside t
 caller names, and each resync in another place and with another form of its reply.
 """
 
-from collections.abc import Awaitable, Callable, Hashable, Sequence
+from collections.abc import Awaitable, Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -85,8 +85,7 @@ class HarmlessReads:
     @property
     def are_beside(self) -> bool:
         """True if one of them leaves out the outstanding read."""
-        reads = (read for place in self._places for reads in place for read in reads)
-        return any(not overlap(read, self.outstanding) for read in reads)
+        return any(beside(reads, self.outstanding) for place in self._places for reads in place)
 
     def pick(self, token: int) -> Span:
         """Returns the read of a token, which grows by two from one resync to the next.
@@ -130,19 +129,13 @@ def _place(
         if len(begin) == MOST_FORMS:
             break
     ends = list(begin.values()), list((end or begin).values())
-    beside = [[read for read in reads if not overlap(read, outstanding)] for reads in ends]
-    enough = [reads for reads in beside if reads]
+    enough = [left for reads in ends if (left := beside(reads, outstanding))]
     return (enough[0], enough[-1]) if enough else ends
 
 
-def overlap(one: Span, other: Span | None) -> bool:
-    """Returns True if they have an address in common."""
-    return (
-        other is not None
-        and one.area == other.area
-        and one.start < other.start + other.size
-        and other.start < one.start + one.size
-    )
+def beside(spans: Iterable[Span], outstanding: Span | None) -> list[Span]:
+    """Returns those of the spans that have no address of the `outstanding` read."""
+    return [span for span in spans if outstanding is None or not span.overlaps(outstanding)]
 
 
 @lru_cache(1024)

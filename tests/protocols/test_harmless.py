@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, AnyDriver, Span
-from gateway.protocols.harmless import ENDS_FOR, HarmlessReads, overlap
+from gateway.protocols.harmless import ENDS_FOR, HarmlessReads
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
@@ -169,7 +169,7 @@ def test_a_resync_leaves_out_the_read_that_had_no_reply(
     reads = HarmlessReads([block, block], outstanding, DRIVERS[0].reply_shape, numbered)
     assert reads.are_beside
     for token in range(2, 40):
-        assert not overlap(reads.pick(token), outstanding)
+        assert not reads.pick(token).overlaps(outstanding)
 
 
 def test_two_resyncs_in_a_row_do_not_read_the_same_end_of_a_block() -> None:

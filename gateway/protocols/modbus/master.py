@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Refused, RefusedOther, Took
 from gateway.protocols.driver import EVERY_REQUEST, PROOF, Span, Talk, Unit
-from gateway.protocols.harmless import HarmlessReads, overlap, resync_by_reads
+from gateway.protocols.harmless import HarmlessReads, beside, resync_by_reads
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Place
 from gateway.protocols.modbus.frame import EXCEPTION, Frame, answer_length
@@ -216,7 +216,7 @@ class Master(Settings):
         inside = HarmlessReads(spans, outstanding, self.reply_shape, self.numbered)
         # The device may be silent about the outstanding address: the others are asked first. One
         # that is not in the spans is known as bad, or was written: nothing near it is read.
-        alike = [span for span in spans if not overlap(span, outstanding)]
+        alike = beside(spans, outstanding)
         if inside and (inside.are_beside or not alike):
             return lambda token: (inside.proof() if token == PROOF else None) or inside.pick(token)
         beyond = self._harmless(spans[0] if spans and outstanding not in spans else outstanding)
