@@ -124,6 +124,8 @@ async def test_the_status_counts_answered_calls() -> None:
 
         def shown() -> Any:
             documents: Any = served_documents([caller.line], now())
+            assert documents["lines/center"]["served"]
+            assert documents["devices/vr1"]["stale_after"] is None  # the values stay
             return documents["lines/center"]["calls"]
 
         quiet = shown()
@@ -157,6 +159,22 @@ async def test_stale_after_counts_from_the_last_request() -> None:
         assert [sample.quality for sample in caller.now] == [Quality.GOOD]
         await asyncio.sleep(1_000)
         assert [sample.quality for sample in caller.now] == [Quality.GOOD, Quality.BAD]
+
+
+@on_virtual_time
+async def test_a_silent_master_and_a_lost_wire_are_reported() -> None:
+    async with ready(Caller(center(stale_after="10s"))) as caller:
+        await caller.call()
+        await caller.ask(WRITE)
+        await asyncio.sleep(11)
+        assert caller.present == [True, False]
+        await caller.ask(WRITE)
+        assert caller.cable is not None
+        caller.cable.receiver.lost(LineDown("unplugged"))
+        await asyncio.sleep(0.05)
+        assert caller.present == [True, False] * 2
+        caller.model.online = False
+        await asyncio.sleep(10)
 
 
 @on_virtual_time

@@ -12,7 +12,8 @@ from gateway.config import built
 from gateway.errors import BadValue, Busy
 from gateway.parts.serving.part import ServingPart
 from gateway.plant.plant import Plant
-from gateway.tags import Quality, Reason, Tag, WriteResult
+from gateway.stations.store import Denied
+from gateway.tags import Quality, Reason, Tag, WriteResult, bad, good
 from gateway.transport import TcpAddress, listen
 from gateway.values import Value
 from tests.parts.made import parts_of
@@ -28,10 +29,15 @@ TAGS = {
 
 
 def gateway(folder: Path) -> Plant:
-    hmi = {"protocol": "modbus-tcp", "accept": ["holding:100"], "tags": TAGS}
+    return plant({"gateway": {"state": "state.json"}}, TAGS, folder)
+
+
+def plant(top: dict[str, Any], tags: dict[str, Any], folder: Path) -> Plant:
+    hmi = {"protocol": "modbus-tcp", "accept": ["holding:100"], "tags": tags}
     panel = {"port": "tcp://127.0.0.1:502", "serve": True, "devices": {"hmi": hmi}}
-    data: dict[str, Any] = {"gateway": {"state": "state.json"}, "lines": {"panel": panel}}
-    made = Plant(built(data, folder))
+    mixer = {"protocol": "vigor", "station": 1, "tags": {"speed": {"address": "D0"}}}
+    hall = {"port": "/dev/ttyS99", "devices": {"mixer": mixer}}
+    made = Plant(built({**top, "lines": {"hall": hall, "panel": panel}}, folder))
     parts_of(made, "serving")
     return made
 
@@ -85,6 +91,35 @@ async def test_several_held_values_change_all_at_once_or_none(tmp_path: Path) ->
     assert one.sample(tag(one, "name")).value == "AB"
 
 
+async def test_a_held_value_without_a_state_file_is_lost_with_the_process(tmp_path: Path) -> None:
+    one = plant({}, {"limit": {"address": "holding:1", "write": True}}, tmp_path)
+    await served(one).begin()
+    began = asyncio.get_running_loop().time()
+    written = await write(one, tag(one, "limit"), 42)
+    assert (written.value, written.took < began) == (42, True)
+    assert one.sample(tag(one, "limit")).value == 42
+
+
+async def test_a_master_reads_the_last_good_value_of_a_source_that_turned_bad(
+    tmp_path: Path,
+) -> None:
+    """Nobody read it while it was good."""
+    row: dict[str, Any] = {"source": "mixer/speed", "type": "uint16"}
+    kept = {**row, "address": "holding:2", "hold_last": True}
+    one = plant({}, {"now": {**row, "address": "holding:1"}, "last": kept}, tmp_path)
+    [line] = served(one).lines
+    [station] = line.stations.values()
+    speed = one.tag("mixer/speed")
+    assert speed is not None
+    one.samples([good(speed, 7, 0)])
+    one.samples([bad(speed, Reason.NO_REPLY, 1)])
+    assert station.registers.read("holding", 2, 1) == [7]
+    with pytest.raises(Denied):
+        station.registers.read("holding", 1, 1)
+    one.samples([good(speed, 8, 2)])
+    assert station.registers.read("holding", 1, 2) == [8, 8]
+
+
 async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> None:
     (tmp_path / "state.held.json").write_text('{"form": 1, "held": [')
     one = gateway(tmp_path)
@@ -102,7 +137,7 @@ async def test_a_held_value_outside_new_limits_is_dropped(tmp_path: Path) -> Non
 
 async def test_direct_access_sends_nothing_on_the_wire_of_a_master(tmp_path: Path) -> None:
     config = gateway(tmp_path).config
-    tags = config.devices[0].tags
+    tags = config.devices[1].tags
     order, limit = tags[2], tags[0]
     [sample] = await direct.read(config, [order])
     assert sample.reason is Reason.LINE_DOWN

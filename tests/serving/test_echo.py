@@ -63,6 +63,15 @@ def test_echoes_on_their_way_keep_their_order() -> None:
     assert made.written == [{"setpoint": 9}, {"setpoint": 7}, {"setpoint": 7}]
 
 
+def test_a_request_before_the_echo_can_have_arrived_is_answered() -> None:
+    """The delay counts from the reply, 32 ms after its request at this speed."""
+    made = bench(baudrate=1200)
+    assert len(on_the_wire(made, [(1.0, READ)], 0.08)) == 1
+    replies = on_the_wire(made, [(3.0, WRITE), (3.065, WRITE)], 0.08)
+    assert [reply for _, reply in replies] == [WRITE, WRITE]
+    assert replies[1][0] == pytest.approx(3.097, abs=0.001)
+
+
 class Written(list[bytes]):
     """A port that keeps what is written."""
 

@@ -87,14 +87,21 @@ def test_other_stations_are_ignored_with_their_replies() -> None:
     assert made.ask(rtu("03 03 0000 0004"), after=0.01) == b""
     # The reply holds a request to station 1, with its check sum.
     assert made.ask(rtu("03 03 08" + rtu("01 06 0004 0007").hex()), after=0.01) == b""
+    assert made.ask(rtu("03 10 0004 0001 02 0007"), after=0.01) == b""
+    assert made.ask(rtu("03 10 0004 0001") + READ, after=0.01) == VALUE
     assert made.written == []
     assert made.ask(READ, after=0.005) == VALUE
 
 
-def test_the_reply_of_another_station_in_pieces_is_no_request() -> None:
-    made = bench()
-    reply = rtu("03 03 08" + rtu("01 06 0004 0007").hex())
-    whole = rtu("03 03 0000 0004") + reply
+@pytest.mark.parametrize(
+    ("request_", "reply"),
+    [
+        ("03 03 0000 0004", "03 03 08" + rtu("01 06 0004 0007").hex()),
+        ("09 01 0000 0030", "09" + rtu("01 06 0004 0007").hex()),  # 48 coils, from the function on
+    ],
+)
+def test_the_reply_of_another_station_in_pieces_is_no_request(request_: str, reply: str) -> None:
+    made, whole = bench(), rtu(request_) + rtu(reply)
     for size in (1, 3, 11):  # with the pauses of an adapter
         for at in range(0, len(whole), size):
             assert made.ask(whole[at : at + size], after=0.006) == b""

@@ -94,6 +94,20 @@ def test_the_limit_of_a_json_number(
     assert exact_below(parse_type(kind), line) == limit
 
 
+@pytest.mark.parametrize(
+    ("kind", "scale", "type_"),
+    [
+        ("bcd16", 5, "uint16"),  # 9999 x 5
+        ("bcd16", 7, "int32"),
+        ("bcd32", 20, "int32"),
+        ("bcd32", 0.1, "float64"),
+        ("uint64", 2, "float64"),
+    ],
+)
+def test_the_type_of_a_scaled_value(kind: str, scale: float, type_: str) -> None:
+    assert tag(kind, scale=scale).value_type == type_
+
+
 def test_a_whole_scale_and_offset_keep_an_integer() -> None:
     for kind in KINDS:
         scaled = tag(kind, scale=2.0, offset=-3.0)
@@ -108,6 +122,7 @@ def test_a_double_word_with_many_decimals_is_exact() -> None:
 def test_a_value_beyond_64_bits_is_the_next_float() -> None:
     wide = tag("uint64", scale=10)
     assert orjson.loads(orjson.dumps(wide.decode([0xFFFF] * 4))) == 1.8446744073709552e20
+    assert type(tag("uint64", offset=1).decode([0xFFFF] * 4)) is float
 
 
 @pytest.mark.parametrize("value", [float("nan"), 10**300, -1.0e300])

@@ -4,7 +4,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from gateway.errors import CallEnded, LineDown
-from gateway.stations.served.answering import NOISE, Heard
+from gateway.stations.served.answering import NOISE, Answerer, Heard
 from gateway.transport import Port
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ class Conversation:
         self._line = line
         self._network = network
         self._may_write = True
-        self._machine = line.machine()
+        self._machine: Answerer
         self._port: Port | None = None
         self._reply: asyncio.TimerHandle | None = None
         self._closing: asyncio.Task[None] | None = None

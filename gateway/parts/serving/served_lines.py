@@ -82,7 +82,7 @@ class ServedLines:
         loop = asyncio.get_running_loop()
         started, held = loop.time(), dict[Tag, Value]()
         for tag, value in values:
-            if tag not in self._rows or self._rows[tag].tag.write is None:
+            if tag.write is None:
                 raise BadValue(f"{tag.key} is written by the master")
             real = tag.from_units(tag.encode(value))
             if real is None:

@@ -59,7 +59,7 @@ class _Line:
             elif not answer.written:
                 continue
             done.append(Done(one, answer.refused, answer.write, tuple(answer.written)))
-        return Heard(reply, delay if reply else 0.0, tuple(done))
+        return Heard(reply, delay, tuple(done))
 
 
 def computer_link(stations: Stations, wire: Wire) -> Answerer:

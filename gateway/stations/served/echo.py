@@ -63,11 +63,8 @@ class Echo:
         """Returns the origin of a frame."""
         self._forget(now)
         place = next((i for i, one in enumerate(self._replies) if one.frame == frame), None)
-        if place is None and self.told is None:
+        if place is None:
             return self._late(frame, now)
-        if place is None or self.told is False:
-            self._equal = 0
-            return Sort.REQUEST
         one = self._replies[place]
         if one.proves:
             self._known, self._delay = True, min(self._delay or 9.0, now - one.at)

@@ -59,7 +59,7 @@ class Registers:
         self._accepted = {cell for span in served.accept for cell in cells_of(span)}
         self._written: dict[Cell, int] = {}
         self._good: set[Tag] = set()  # of those that the master writes
-        self._last: dict[ServedTag, Sequence[int]] = {}  # the last good units
+        self._last: dict[ServedTag, Sequence[int]] = {}  # the last good units, with `hold_last`
 
     @property
     def written_tags(self) -> list[Tag]:
@@ -116,9 +116,9 @@ class Registers:
     def _units(self, row: ServedTag) -> Sequence[int]:
         units = _encoded(row.tag, self._sample_of(row))
         if units is None:
-            if row.hold_last and row in self._last:
-                return self._last[row]
-            raise Denied(Why.BAD)
+            if row not in self._last:
+                raise Denied(Why.BAD)
+            return self._last[row]
         if row.hold_last:
             self._last[row] = units
         return units
