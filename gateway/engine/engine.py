@@ -162,6 +162,12 @@ class Engine:
             charged = self._charged
             if charged is not None and (len(self.devices) > 1 or not isinstance(charged, Device)):
                 charged.used(now, in_flight.begun)
+                if (
+                    good
+                    and isinstance(job, Poll)
+                    and job.device.turnaround.took(now - in_flight.begun)
+                ):
+                    self.rules.troubled.add(job.device)
         effects, self._effects.collected = self._effects.collected, []
         if not good or len(effects) != 1 or self.deadline <= now:
             self._set_deadline()  # a good end alone makes it no earlier

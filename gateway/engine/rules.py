@@ -9,6 +9,7 @@ from gateway.engine.effects import Effects
 from gateway.engine.results.bit_writes import BitWrites
 from gateway.engine.results.broadcast_replies import BroadcastReplies
 from gateway.engine.results.busy_devices import BusyDevices
+from gateway.engine.results.giving_way import GivingWay
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.identities import Identities
 from gateway.engine.results.line_silence import LineSilence
@@ -51,6 +52,7 @@ def rules_of(line: LineState) -> Sequence[Rule]:
         ShorterSilences(line.name, devices, line.in_flight, effects),
         Pipelining(line.in_flight, effects),
         BusyDevices(),
+        GivingWay(devices, line.schedule, line.in_flight),
         BroadcastReplies(devices),
         BitWrites(),
         Identities(devices, line.schedule, line.in_flight, effects),

@@ -7,18 +7,25 @@ from gateway.engine.device.health import FORGOTTEN
 from gateway.engine.device.identity import SILENT_FOR
 from gateway.engine.device.longer_reads import REFUSED_FOR as LONGER_REFUSED_FOR
 from gateway.engine.device.monitor_list import REFUSED_FOR as LIST_REFUSED_FOR
-from gateway.engine.device.probe_pace import ALIVE_FOR, LATE_FOR, PROBE_PAUSE, PROBE_SPREAD
+from gateway.engine.device.probe_pace import (
+    ALIVE_FOR,
+    HOPE_FOR,
+    LATE_FOR,
+    PROBE_PAUSE,
+    PROBE_SPREAD,
+)
 from gateway.engine.device.records import QUICKEST_OF
 from gateway.engine.device.reply_shapes import WARY_FOR
+from gateway.engine.device.second_requests import MOST_SILENT
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
-from gateway.engine.device.turnaround import LEARN_EVERY
+from gateway.engine.device.turnaround import LEARN_EVERY, SLOW
 from gateway.engine.device.twins import FOR
 from gateway.engine.jobs.poll_entry import OWED
 from gateway.engine.jobs.unanswered import SEEN_FOR
 from gateway.engine.results.bit_writes import LACKED_FOR
 from gateway.engine.results.busy_devices import LONGEST as LONGEST_BUSY
+from gateway.engine.results.giving_way import LONGEST as LONGEST_WAY
 from gateway.engine.results.pipelining import TRY_AGAIN
-from gateway.engine.results.second_requests import MOST_SILENT
 from gateway.planning.bad_addresses import RETRIES, SPLIT_LONGEST
 from gateway.protocols.resync_kind import MISSES
 
@@ -169,6 +176,20 @@ BELIEFS = (
         "another reply; it is polled again after each pause",
         "it is polled as usual",
         LONGEST_BUSY,
+    ),
+    Belief(
+        "a device takes more of the wire than planned",
+        f"its last good poll took {SLOW:g} times as long as planned",
+        "a poll that does not; it is polled after a minute at the latest",
+        "its polls go when they are due",
+        LONGEST_WAY,
+    ),
+    Belief(
+        "a device that replies has no good values",
+        f"none for {HOPE_FOR:g} s, while it was online",
+        "a good value, or it goes offline; it is polled after a minute at the latest",
+        "its polls go when they are due",
+        LONGEST_WAY,
     ),
     Belief(
         "a device is offline",

@@ -20,6 +20,7 @@ from gateway.engine.jobs.requests import Write
 from gateway.engine.jobs.unanswered import Unanswered
 from gateway.engine.results.bit_writes import BitWrites
 from gateway.engine.results.busy_devices import BusyDevices
+from gateway.engine.results.giving_way import GivingWay
 from gateway.engine.results.pipelining import Pipelining
 from gateway.engine.results.shorter_silences import ShorterSilences
 from gateway.engine.schedule.probes import is_noisy
@@ -29,7 +30,7 @@ from gateway.planning.planner import Block
 from gateway.protocols.resync_kind import ResyncKind
 from gateway.tags import WriteRule
 from tests.engine.beliefs import BELIEFS, Belief, table
-from tests.engine.rig import SILENCE, Rig, bit_device, link_device, tcp_device
+from tests.engine.rig import SILENCE, UNANSWERED, Rig, bit_device, link_device, tcp_device
 from tests.sim.plant import device, make_tag
 
 HOUR = 3600.0
@@ -350,6 +351,27 @@ def busy() -> Way:
     return given_up
 
 
+def takes_more_than_planned() -> Way:
+    device = link_device()
+    for _ in range(int(HOUR)):
+        device.turnaround.took(10 * device.turnaround.planned_poll)
+    assert device.is_slow
+    device.turnaround.took(device.turnaround.planned_poll)
+    return lambda _: not device.is_slow
+
+
+def no_good_value() -> Way:
+    rig = Rig(link_device(), link_device(station=2))
+    (rule,) = (one for one in rig.engine.rules.all if isinstance(one, GivingWay))
+    rig.device.health.answered(resynced=True)
+    (entry,) = rig.engine.schedule.polls(rig.device)
+    for second in range(0, int(HOUR), 10):
+        rule.concluded(entry.job, NO_ADDRESS, UNANSWERED, float(second), 0)
+    assert rule.takes(rig.device, HOUR)
+    rig.engine.schedule.read(entry, [0] * entry.block.span.size, HOUR, 0)
+    return lambda _: not rule.takes(rig.device, HOUR)
+
+
 def offline() -> Way:
     health = link_device().health
     for second in range(0, int(HOUR), 4):
@@ -488,6 +510,8 @@ WAYS: dict[str, Callable[[], Way]] = {
     "does not change bits by itself": changes_no_bits,
     "is silent about its identity": silent_about_identity,
     "a device is busy": busy,
+    "a device takes more of the wire than planned": takes_more_than_planned,
+    "a device that replies has no good values": no_good_value,
     "a device is offline": offline,
     "a device that is never read does not answer": never_read,
     "noise destroys its replies": noise,

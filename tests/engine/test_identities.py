@@ -30,12 +30,13 @@ LACKS = Refused("no such function", code="01", unexecuted=True)
 BUSY = Refused("busy", code="06", refusal=Refusal.BUSY, unexecuted=True)
 
 
-def meter(station: int = 1, *, retries: int = 1) -> Device:
+def meter(station: int = 1, *, retries: int = 1, every: float = 1.0) -> Device:
     driver = ModbusRtu(station=station)
     timing = replace(driver.timing, reply_timeout=0.5, retries=retries)
-    tags = [make_tag("holding:1", driver, write=WriteRule(), device=f"meter{station}")]
+    name = f"meter{station}"
+    tags = [make_tag("holding:1", driver, write=WriteRule(), device=name, every=every)]
     identity = {"vendor": "ABB"}
-    return made_device(f"meter{station}", driver, WIRE, timing, tags, identity=identity)
+    return made_device(name, driver, WIRE, timing, tags, identity=identity)
 
 
 def asked(rig: Rig) -> Identify:
@@ -74,14 +75,26 @@ def known(rig: Rig) -> Rig:
     return rig
 
 
-def test_it_is_asked_before_the_first_value_and_then_at_a_slow_interval(rig: Rig) -> None:
-    begun = rig.now
+def test_it_is_asked_before_the_first_value_and_then_in_each_cycle_of_its_polls(rig: Rig) -> None:
     rig.conclude(asked(rig), SELF)
     assert rig.samples == []
+    begun = rig.now
     again = asked(rig)
     assert is_good(rig)
-    assert RECHECK <= rig.now - begun < RECHECK + 2
+    cycle = rig.device.blocks[0].every
+    assert cycle <= rig.now - begun < 1.2 * cycle
     rig.conclude(again, SELF)
+
+
+def test_on_a_line_without_free_time_it_is_asked_rarely() -> None:
+    rig = Rig(meter(every=0.01))
+    assert rig.device.load > 1
+    rig.conclude(asked(rig), SELF)
+    begun, polls = rig.now, len(rig.samples)
+    while not isinstance(job := rig.transacted(), Identify):
+        rig.conclude(job, [len(rig.samples)])
+    assert rig.now - begun >= RECHECK
+    assert len(rig.samples) > polls + 100
 
 
 def test_another_device_has_no_good_values_and_takes_no_writes(known: Rig) -> None:

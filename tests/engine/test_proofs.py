@@ -217,6 +217,27 @@ def test_reads_without_a_proof_turn_the_tags_bad_after_the_retries() -> None:
     assert {(one.quality, one.detail) for one in rig.samples} == {(Quality.BAD, UNPROVEN)}
 
 
+def test_after_many_proofs_in_vain_a_read_is_tried_once_in_each_interval() -> None:
+    rig = doubtful(link_device(retries=2))
+    every, at = rig.device.blocks[0].every, list[float]()
+    while rig.now < 20 * every:
+        read(rig)
+        at.append(rig.now)
+        hear(rig)
+        prove(rig)
+    first, later = (sum(begin < t / every < begin + 5 for t in at) for begin in (0, 15))
+    assert first > 8
+    assert later == 5
+    read(rig)
+    prove(rig)  # one proof ends it
+    read(rig)
+    hear(rig)
+    prove(rig)
+    failed = rig.now
+    read(rig)
+    assert rig.now - failed < every / 2
+
+
 def late_read(rig: Rig, turnaround: float) -> None:
     """Performs the next poll; its reply has this turnaround."""
     while not isinstance(job := rig.transacted(), Poll):

@@ -2,7 +2,7 @@
 
 from gateway.engine.device.device import Device as EngineDevice
 from gateway.engine.device.probe_pace import LATE_FOR, LATE_MOST
-from gateway.engine.results.second_requests import (
+from gateway.engine.device.second_requests import (
     MOST_SILENT,
     is_like_a_second,
     leave_second,

@@ -2,12 +2,12 @@
 
 The seed draws a line of one protocol with 3 to 12 stations, and how one of them is broken from the
 second minute on. All others must keep their sweeps, their write times and their return times. They
-share the pair with it: what it sends collides. Three kinds take a part of the wire that no master
+share the pair with it: what it sends collides. Two kinds take a part of the wire that no master
 can give back; the judge knows how much, and asks for the rest:
 
-* A slow station replies within its time-out. Each of its exchanges holds the wire for that time.
 * A flooding station replies, with junk before and a second reply behind. It has the wire until
-  another one is asked, and each read on the line needs a proof, as `check` prints.
+  another one is asked. Each read on the line needs a proof, which takes about as long as `check`
+  prints. Where the station itself has little of the wire, what is lost is due to these proofs.
 * A bursting station speaks by itself, and destroys one exchange each time.
 """
 
@@ -51,6 +51,7 @@ KINDS = (
 )
 # Of the sweeps of the others, or of those that the wire could carry. What proofs take is estimated.
 KEPT, KEPT_DOUBTFUL = 0.98, 0.9
+LITTLE, KEPT_BY_PROOFS = 0.03, 0.5  # of the wire that the station has; of that estimate
 REST = (3.0, 20.0)  # seconds between two bursts
 WRITTEN, OLD = 900, 3000  # the address that is written; ms that a value may be old
 WARM = 60.0  # seconds before anything is broken
@@ -109,7 +110,6 @@ class Part:
                 return [whole[: chance.randrange(1, len(whole))]]
             case "slow":
                 self.delay = chance.uniform(0.5, 0.9) * timeout
-                self.took += self.delay + TURNAROUND
                 return [whole]
             case "late":
                 self.delay = chance.uniform(1.1, 4.0) * timeout
@@ -289,7 +289,9 @@ class Life:
     def judge(self, since: float) -> None:
         plant, seconds = self.drawn.plant, now() - since - self.left
         could = self.could(seconds)
-        least = could * (KEPT_DOUBTFUL if self.drawn.kind == "flooding" else KEPT)
+        least = could * KEPT
+        if self.drawn.kind == "flooding" and could < 1.0:
+            least = could * (KEPT_BY_PROOFS if self.bad.took < LITTLE * seconds else KEPT_DOUBTFUL)
         self.story.counts["most % taken"] = round(100 * self.bad.took / seconds)
         for one in self.healthy:
             reads = len(plant.reads(one, since))

@@ -32,6 +32,10 @@ ANSWERS_TWICE = (
     "Answers twice: a second master is on the line, two stations have the number {station}, or a "
     "device server repeats replies"
 )
+GIVES_WAY = (
+    "A poll takes {slow:.2f} s, planned are {planned:.2f} s: it waits where others need the wire; "
+    "set `turnaround`"
+)
 ECHO_PROVEN_FOR = 2.0  # seconds after which an adapter may echo that did not before
 # A reply is late from so many seconds on, at least, and from so many times the usual turnaround
 LATE, SLOWER = 0.02, 3.0
@@ -160,6 +164,9 @@ class Device:
             if self.one_at_a_time:
                 why = f"It takes one request at a time, not {self.window}: set `window: 1`"
                 return Diagnosis("one-at-a-time", why)
+            if (found := self.turnaround).gives_way:
+                slow, planned = found.slow, found.planned_poll
+                return Diagnosis("gives-way", GIVES_WAY.format(slow=slow, planned=planned))
             return NO_TROUBLE
         if isinstance(trouble, NoReply | Garbled) and trouble.evidence is not Evidence.SLOW:
             trouble = self.record.recent.usual() or trouble
@@ -261,7 +268,7 @@ class Device:
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
-        self.turnaround.replan()
+        self.turnaround.replan(self._longest_at_first)
         self.good_reads.replan()
         bad.changed.clear()
         if self.shapes is not None:
@@ -296,12 +303,19 @@ class Device:
                 break
         kept = [block for place, block in enumerate(blocks) if place not in near]
         self.good_reads.replan()
-        self.turnaround.replan()
         found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
+        self.turnaround.replan(self._longest_at_first)
         if self.shapes is not None:
             self.shapes.longer.planned(self.blocks)
         return self.planning_seconds(tags)
+
+    @property
+    def _longest_at_first(self) -> float:
+        """Seconds of its longest poll at the turnaround of the file, as `check` says it."""
+        given, times = self.settings.turnaround, self.window * self.settings.verify_reads
+        polls = (self.wire.transaction(one.cost, self.timing, given) for one in self.blocks)
+        return times * max(polls, default=math.inf)
 
     @property
     def _monitored(self) -> bool:
@@ -424,6 +438,11 @@ class Device:
             self.shapes.also_sent(self.shapes.of_resync(outstanding, token, spans), now)
 
     # Its share of the wire
+
+    @property
+    def is_slow(self) -> bool:
+        """True if its last poll took much longer than the plan says."""
+        return self.turnaround.slow > 0.0
 
     def used(self, now: float, begun: float) -> None:
         """Adds the time since `begun` of a poll or a probe. Past use counts half after `HALF_LIFE`.

@@ -7,8 +7,9 @@ from enum import StrEnum
 from gateway.errors import NO_TROUBLE, Diagnosis
 
 NEVER = float("inf")
-RECHECK = 10.0  # seconds between two questions, at least
-SHARE = 0.01  # of the wire time, for all devices of a line together
+RECHECK = 10.0  # seconds between two questions where the wire has no time left
+SHARE = 0.01  # of the wire time then, for all devices of a line together
+SHORTEST, FREE_SHARE = 1.0, 0.25  # seconds between two; of the time that polls leave
 SILENT_TRIES = 3  # questions without a reply after which a device tells nothing
 SILENT_FOR = 3600.0  # seconds until a silent one is asked again
 PAUSE = 1.0  # seconds after a question that failed, doubled up to `RECHECK`
@@ -67,7 +68,7 @@ class Identity:
             wanted = ", ".join(f"{name} {self.wanted[name]}" for name in others)
             why = f"Another device replies: it tells {found}; the file says {wanted}"
             self.why = Diagnosis("another-device", why)
-        self.due = now + max(pause, RECHECK)
+        self.due = now + pause
 
     def refused(self, error: str, now: float) -> None:
         """Applies the refusal of a question."""

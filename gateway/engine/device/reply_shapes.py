@@ -25,6 +25,7 @@ WARY_FOR = 600.0  # seconds
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
 INSIDE = 64  # units of a read inside a block, at most
+IN_VAIN = 8
 MOST_HELD = 8  # reads that one resync proves, at most
 NEVER = float("inf")
 UNPROVEN = "extra replies may arrive on this line, and nothing proves this read"
@@ -73,6 +74,7 @@ class ProofPace:
     """The reads of one device that a resync proves. Noise destroys the proof of many more often."""
 
     most: int = 1
+    _in_vain: int = 0  # resyncs in a row that proved nothing
     lacked_until: float = -NEVER  # until then it has no read with a form of its own: refused
 
     # Until then it is silent about the reads that the second request of a resync may have.
@@ -82,6 +84,12 @@ class ProofPace:
     def ended(self, *, proven: bool) -> None:
         """Notes the end of reads that waited for one resync."""
         self.most = min(2 * self.most, MOST_HELD) if proven else 1
+        self._in_vain = 0 if proven else self._in_vain + 1
+
+    @property
+    def are_in_vain(self) -> bool:
+        """True if none of the last reads had its proof: another try only takes the wire."""
+        return self._in_vain >= IN_VAIN
 
     def lacks(self, now: float) -> None:
         """Notes that the device refused the read with a form of its own."""

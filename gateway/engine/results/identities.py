@@ -4,7 +4,14 @@ from collections.abc import Sequence
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
-from gateway.engine.device.identity import SHARE, Identity, Verdict
+from gateway.engine.device.identity import (
+    FREE_SHARE,
+    RECHECK,
+    SHARE,
+    SHORTEST,
+    Identity,
+    Verdict,
+)
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import Identified, Identify, Result, Traffic, Transacted
 from gateway.engine.results.rule import NEVER, Rule
@@ -17,8 +24,9 @@ from gateway.tags import Reason
 class Identities(Rule):
     """Asks the devices that have `identity` in the file which ones they are.
 
-    Before the first value after the line was opened or the device was silent, and then at a slow
-    interval, in all a hundredth of the wire.
+    Before the first value after the line was opened or the device was silent. Then once in each
+    cycle of its polls, if a quarter of the time that the polls leave is enough; otherwise every ten
+    seconds, in all a hundredth of the wire.
     """
 
     def __init__(
@@ -65,7 +73,7 @@ class Identities(Rule):
         if not isinstance(job, Identify) or identity is None:
             return
         before = identity.verdict
-        self._applied(identity, result, now)
+        self._applied(device, identity, result, now)
         if identity.verdict is not before and identity.why.text:
             self._effects.warning("identity doubtful", device=device.name, why=identity.why.text)
         if identity.verdict is Verdict.WRONG is not before:
@@ -76,17 +84,27 @@ class Identities(Rule):
             for request in self._schedule.requests.withdraw(device):
                 self._effects.unsent(request, wrong_device(device))
 
-    def _applied(self, identity: Identity, result: Result, now: float) -> None:
+    def _applied(self, device: Device, identity: Identity, result: Result, now: float) -> None:
         match result:
             case Identified(told):
-                others = sum(one.identity is not None for one in self._devices)
-                identity.answered(told, now, (now - self._in_flight.begun) * others / SHARE)
+                identity.answered(told, now, self._pause(device, now))
             case Refused(refusal=Refusal.BUSY | Refusal.DAMAGED):
                 identity.later(now)
             case Refused():
                 identity.refused(str(result), now)
             case Unclear():
                 identity.unanswered(now)
+
+    def _pause(self, device: Device, now: float) -> float:
+        """Returns the seconds until the next question, after one that was answered."""
+        asked = sum(one.identity is not None for one in self._devices)
+        all_asked = (now - self._in_flight.begun) * asked
+        longest = max(all_asked / SHARE, RECHECK)
+        free = (1.0 - sum(one.load for one in self._devices)) * FREE_SHARE
+        if free * longest <= all_asked:
+            return longest
+        cycle = min((block.every for block in device.blocks), default=RECHECK)
+        return min(max(cycle, SHORTEST, all_asked / free), longest)
 
 
 def _question(device: Device) -> Identify:

@@ -1,6 +1,7 @@
 """Applies the result of a job that is no good read, and decides what follows it."""
 
 from gateway.engine.device.health import State
+from gateway.engine.device.second_requests import is_like_a_second, leave_second, second_token
 from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import (
     Answer,
@@ -29,7 +30,6 @@ from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.proofs import Proofs
 from gateway.engine.results.request_rules import RequestRules
-from gateway.engine.results.second_requests import is_like_a_second, leave_second, second_token
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.errors import (
     BadValue,

@@ -109,8 +109,11 @@ class PollRules:
                 self._effects.info("field garbled", device=device.name, **log_fields(value))
 
     def unsteady(self, poll: PollEntry, error: Unsteady, now: float, time: int) -> None:
-        """Applies two different reads of a block: polls it again, or turns its tags bad."""
-        if poll.tries < poll.device.timing.retries:
+        """Applies two different reads of a block, or one without a proof: polls it again, or turns
+        its tags bad."""
+        shapes = poll.device.shapes
+        in_vain = shapes is not None and shapes.proofs.are_in_vain
+        if poll.tries < poll.device.timing.retries and not in_vain:
             self._schedule.again(poll)
             return
         poll.device.bad_addresses.replied(poll.block.span)
