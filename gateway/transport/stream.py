@@ -38,9 +38,7 @@ class Allowance:
 
     def requested(self) -> None:
         """Allows the reply to one more request."""
-        self._level -= PER_REQUEST
-        if self._level < 0.0:
-            self._level = 0.0
+        self._level -= PER_REQUEST  # `received` begins at 0 again: no request is saved up
 
     def received(self, size: int, now: float) -> float:
         """Notes received bytes. Returns the bytes per second if they are too many, else 0."""

@@ -247,11 +247,19 @@ def test_mistakes_of_a_device(tmp_path: Path, device: str, sentence: str) -> Non
             '{tags: {"a-{i}": {repeat: 9999, address: "D{i}"}, "b-{i}": {repeat: 99999}}}',
             "99999 is no count from 1 to 10000",
         ),
+        # The device has tags and defaults of its own.
+        ("{tags: [1]}", "templates.t.tags: used by p in line 9: a list stands where settings"),
+        ("{defaults: 5}", "templates.t.defaults: used by p in line 9: 5 stands where settings"),
+        (
+            "{defaults: {tags: {a: 1}}}",
+            "templates.t.defaults.tags: used by p in line 9: no setting",
+        ),
     ],
 )
 def test_mistakes_of_a_template(tmp_path: Path, template: str, sentence: str) -> None:
     text = f"templates:\n  t: {template}\n{HEAD}"
-    text += "      p: {use: t, protocol: vigor, station: 1, tags: {x: {address: D5}}}\n"
+    text += "      p: {use: t, protocol: vigor, station: 1, defaults: {every: 1s},\n"
+    text += "        tags: {x: {address: D5}}}\n"
     found = mistakes(tmp_path, text)
     assert any(sentence in message for message in found), found
 

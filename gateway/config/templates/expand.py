@@ -88,6 +88,7 @@ class Filler:
 
 SECTIONS = ("templates", "templates_from")
 _OWN = {"use", "repeat"}
+_MERGED = ("tags", "defaults")  # name by name
 
 
 def expanded(file: YamlFile, mistakes: Mistakes, folder: FilePath) -> Mapping[str, Any]:
@@ -259,15 +260,20 @@ class _Expansion:
         """Puts settings over those of `found`, tag by tag; a tag of null is removed."""
         for key, value in more.items():
             origin, inner = at.inside(key), (*place, key)
-            if key == "tags" and isinstance(value, dict):
-                tags = found.setdefault("tags", {})
-                for name, (written, settings) in value.items():
-                    self._merge_tag(tags, name, settings, origin.inside(written), (*inner, name))
-            elif key == "defaults" and isinstance(value, dict):
-                self._merge(found.setdefault(key, {}), value, origin, inner)
-            else:
+            if key not in _MERGED or not isinstance(value, dict):
                 found[key] = value
                 self._origins[inner] = origin
+                continue
+            known = found.setdefault(key, {})
+            if not isinstance(known, dict):  # a mistake of a template, which is told at its place
+                continue
+            for name, one in value.items():
+                if key == "tags":
+                    written, settings = one
+                    self._merge_tag(known, name, settings, origin.inside(written), (*inner, name))
+                else:
+                    known[name] = one
+                    self._origins[*inner, name] = origin.inside(name)
 
     def _merge_tag(
         self, tags: dict[str, Any], name: str, settings: Any, origin: Origin, place: Path
