@@ -20,6 +20,7 @@ from gateway.config.whole import whole_text
 from gateway.config.yaml.file import YamlFile, read_yaml
 from gateway.errors import ConfigError
 from gateway.tags import Tag
+from gateway.tags.scaling import Ends
 from tests.config import manual_tables as manual
 from tests.conftest import Command
 
@@ -125,6 +126,14 @@ def test_settings_of_the_device_are_above_those_of_the_template(tmp_path: Path) 
     assert tags(config) == {"p/speed": "D0", "p/valve-1": "M1", "p/more": "D50"}
     speed, valve, _ = config.devices[0].tags
     assert (speed.shaping.scale, speed.every, valve.label.unit, valve.every) == (0.1, 9.0, "A", 2.0)
+
+
+def test_a_list_of_a_template_has_values_of_the_device(tmp_path: Path) -> None:
+    template = "templates:\n  t: {parameters: [low], protocol: vigor, tags: {level: {address: D0, "
+    template += 'from: ["{low}", 20000], to: [0, 100]}}}\n'
+    config = loaded(tmp_path, f"{template}{HEAD}      p: {{use: t, low: 4000, station: 3}}\n")
+    [level] = config.devices[0].tags
+    assert level.shaping.ends == Ends((4000, 20000), (0, 100))
 
 
 def test_a_device_is_repeated(tmp_path: Path) -> None:
@@ -242,6 +251,8 @@ def test_mistakes_of_a_device(tmp_path: Path, device: str, sentence: str) -> Non
         ('{tags: {a: {address: "D{__import__(1)}"}}}', "use whole numbers, parameters, + - * //"),
         ('{tags: {a: {address: "D{1//0}"}}}', "{1//0} divides by 0"),
         ('{tags: {a: {address: "D{9**9**9}"}}}', "use whole numbers, parameters, + - * //"),
+        ('{tags: {a: {address: "D{99999 * 99999}"}}}', "9999800001 is beyond 1000000000"),
+        (f'{{tags: {{a: {{address: "D{{{"1+" * 100}1}}"}}}}}}', "has no expression such as base"),
         ('{tags: {a: {address: "D{1:wide}"}}}', "'wide' is no form such as 04"),
         (
             '{tags: {"a-{i}": {repeat: 9999, address: "D{i}"}, "b-{i}": {repeat: 99999}}}',

@@ -145,6 +145,19 @@ async def test_direct_access_sends_nothing_on_the_wire_of_a_master(tmp_path: Pat
         await direct.write_group(config, [(limit, 1)])
 
 
+Ends = list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]
+
+
+async def connected(number: int, count: int) -> Ends:
+    return [await asyncio.open_connection("127.0.0.1", number) for _ in range(count)]
+
+
+async def ask_all(ends: Ends) -> None:
+    for reader, writer in ends:
+        writer.write(bytes.fromhex("0001 0000 0006 01 06 0064 0001"))
+        assert len(await reader.readexactly(12)) == 12
+
+
 async def test_a_connection_ends_with_bytes_that_are_no_modbus_and_the_next_is_served(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,14 +176,15 @@ async def test_a_connection_ends_with_bytes_that_are_no_modbus_and_the_next_is_s
         assert await reader.read() == b""
         writer.close()
         await writer.wait_closed()
-    ends = [await asyncio.open_connection("127.0.0.1", number) for _ in range(34)]
-    for reader, writer in ends[2:]:
-        writer.write(bytes.fromhex("0001 0000 0006 01 06 0064 0001"))
-        assert len(await reader.readexactly(12)) == 12
-    for reader, writer in ends[:2]:
-        assert await reader.read() == b""  # it sent nothing
+    ends = await connected(number, 30)
+    await ask_all(ends)
+    silent = await connected(number, 2)  # later than the last bytes of the others
+    ends += await connected(number, 2)
+    await ask_all(ends[30:])
+    for reader, writer in silent:
+        assert await reader.read() == b""
         writer.close()
-    ends = [*ends[2:], await asyncio.open_connection("127.0.0.1", number)]
+    ends += await connected(number, 1)
     assert await ends[-1][0].read() == b""  # one too many: all are busy
     task.cancel()
     await asyncio.wait([task])

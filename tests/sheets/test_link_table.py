@@ -90,6 +90,8 @@ def test_data_that_are_read_and_written_are_one_writable_tag() -> None:
         (LINK.replace("D10,", "D1x,"), "row 2: 'D1x' is no address such as D10"),
         (LINK.replace("M100", "X8"), "row 3: X8 has no octal number"),
         (LINK.replace(",5,D10", ",five,D10"), "row 2: 'five' is no number"),
+        (LINK.replace(",10,W", ",100000,W"), "row 2: '100000' is no number"),
+        (LINK.replace(",10,W", ",10000,W"), "row 2: length 10000 is not 1 to 64"),
         (MBUS.replace("5;4;0", "5;2;0"), "row 2: 2 is no device type: 0, 1, 3, 4"),
         (registers(LINK_REGISTERS[:-1]), "D1000 says 2 rows of 7 registers; there are 13"),
         (registers((1, 5, 9, 10, 13, 0, 13, 10)), "row 3: 9 is no command"),

@@ -148,6 +148,11 @@ def test_columns_have_letters() -> None:
     assert [letter(index) for index in (0, 25, 26, 701, 702)] == ["A", "Z", "AA", "ZZ", "AAA"]
 
 
+def test_a_setting_that_a_column_gives_in_part_has_its_place() -> None:
+    found = sheet("Name,Address,Min\nx,D1,5\n")
+    assert found.columns["write"] == found.columns["min"] == "column C (Min)"
+
+
 def test_a_title_that_is_nearly_known_is_a_mistake_and_another_is_reported() -> None:
     found = sheet("Name,Address,Scael,Cabinet\nx,D1,0.1,A7\n")
     assert found.mistakes == [(1, "column C (title)", "no column of tags: did you mean Scale?")]
@@ -276,10 +281,36 @@ def test_a_number_with_two_meanings_is_refused_unless_the_sheet_tells() -> None:
     assert sheet(rows.replace(",", ".").replace(";", ",")).tags["a"]["scale"] == 1.25
 
 
-@pytest.mark.parametrize("text", ["12 mm", "1.2.3", "01. Mai", "1,,2", "--1", "e5", "½"])
+@pytest.mark.parametrize("text", ["12 mm", "1.2.3", "1.234.5", "01. Mai", "1,,2", "--1", "e5", "½"])
 def test_other_texts_are_no_numbers(text: str) -> None:
     with pytest.raises(ConfigError, match="is no number"):
         cells.number(text, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("500 ms", "", "500 ms"),
+        ("1h30m", "", "1h30m"),
+        ("0,5 Sek", "", "0.5s"),
+        ("0,5", "", 0.5),
+        ("500", "ms", "500ms"),
+        ("1,500", "s", "1.5s"),
+    ],
+)
+def test_durations(text: str, unit: str, value: str | float) -> None:
+    assert cells.duration(text, unit) == value
+
+
+@pytest.mark.parametrize("text", ["0=off;1=auto", "0: off, 1: auto", "{0: 'off', 1: \"auto\"}"])
+def test_names_of_numbers(text: str) -> None:
+    assert cells.names(text) == {"0": "off", "1": "auto"}
+
+
+@pytest.mark.parametrize("text", ["off", "0=off;", "0=off;0=auto", "0=;1=auto"])
+def test_other_texts_name_no_numbers(text: str) -> None:
+    with pytest.raises(ConfigError, match="does not name numbers: write 0=off;1=auto"):
+        cells.names(text)
 
 
 @pytest.mark.parametrize(

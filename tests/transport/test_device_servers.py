@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
 from ipaddress import ip_network
 
 import pytest
@@ -154,12 +155,19 @@ async def test_strangers_are_closed_and_the_log_says_what_they_sent(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(f"{MODULE}.REGISTERS_WITHIN", 0.0)
+    monkeypatch.setattr(f"{MODULE}._LOG_EVERY", 0.0)
     server = DeviceServer(b"DTU-1", networks=(ip_network("127.0.0.1"), ip_network("127.0.1.0/24")))
     where, heard = address(server), RecordingReceiver()
     opening = asyncio.create_task(opened(where, heard))
     async with calling(where, by="127.0.0.2") as far, asyncio.timeout(PATIENCE):
         assert await _ended(asyncio.ensure_future(far[0].read()))
     assert "no line allows its address" in capsys.readouterr().out
+    other = replace(where, server=DeviceServer(b"DTU-2"))  # from any address
+    second = asyncio.create_task(opened(other, RecordingReceiver()))
+    async with calling(where, by="127.0.0.2") as far, asyncio.timeout(PATIENCE):
+        assert await _ended(asyncio.ensure_future(far[0].read()))
+    assert "no line has its registration" in capsys.readouterr().out
+    second.cancel()
     monkeypatch.setattr(f"{MODULE}.REGISTERS_WITHIN", PATIENCE)
     async with calling(where, b"DTU-1", by="127.0.1.9"):
         await opening
