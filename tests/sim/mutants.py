@@ -33,7 +33,7 @@ ROOMS = {
     "engine": "engine line",
     "planning": "planning engine",
     "line": "line engine",
-    "tags": "tags engine northbound",
+    "tags": "tags contract engine northbound",
     "values": "test_values.py tags config history/test_timerange.py",
     "protocols": "protocols line",
     "parts/alarms": "alarms",

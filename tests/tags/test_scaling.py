@@ -99,6 +99,8 @@ def test_the_limit_of_a_json_number(
     [
         ("bcd16", 5, "uint16"),  # 9999 x 5
         ("bcd16", 7, "int32"),
+        ("int8", 100, "int32"),  # -12800 to 12700
+        ("int16", -1, "int32"),
         ("bcd32", 20, "int32"),
         ("bcd32", 0.1, "float64"),
         ("uint64", 2, "float64"),
