@@ -275,6 +275,15 @@ def test_mistakes_of_a_template(tmp_path: Path, template: str, sentence: str) ->
     assert any(sentence in message for message in found), found
 
 
+def test_templates_that_repeat_without_end_are_a_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.config.templates.expand._MOST_PARTS", 100)
+    device = "      p: {use: pump, base: 1, valves: 1000, station: 3}\n"
+    found = mistakes(tmp_path, f"{PUMP}{HEAD}{device}")
+    assert any("repeat without end: use a smaller `repeat`" in message for message in found)
+
+
 def test_expressions() -> None:
     values = {"base": 100, "name": "D", "n": 3}
     for text, expected in {

@@ -655,6 +655,13 @@ def test_a_door_needs_a_line_that_sends() -> None:
         built({"lines": {"ovens": served}, "share": {"doors": {"one": door("ovens", "vigor")}}})
 
 
+def test_a_device_that_the_gateway_cannot_serve_has_doors_that_pass_all_on_only() -> None:
+    plc = {"protocol": "fx", "tags": {"t": {"address": "D0"}}}
+    lines = {"hall": {"port": "/dev/ttyS98", "devices": {"plc": plc}}}
+    with pytest.raises(ConfigErrors, match="no device of hall for vigor: none can be asked"):
+        built({"lines": lines, "share": {"doors": {"one": door("hall", "vigor")}}})
+
+
 def test_check_says_who_may_ask_what() -> None:
     settings = door("hall", "modbus-tcp", writes=WRITES, most="90%")
     config = built({"lines": LINES, "share": {"doors": {"laptop": settings}}})

@@ -96,7 +96,7 @@ async def test_a_held_value_without_a_state_file_is_lost_with_the_process(tmp_pa
     await served(one).begin()
     began = asyncio.get_running_loop().time()
     written = await write(one, tag(one, "limit"), 42)
-    assert (written.value, written.took < began) == (42, True)
+    assert (written.value, written.verified, written.took < began) == (42, False, True)
     assert one.sample(tag(one, "limit")).value == 42
 
 
@@ -128,11 +128,13 @@ async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> N
     assert (tmp_path / "state.held.json.bad").exists()
 
 
-async def test_a_held_value_outside_new_limits_is_dropped(tmp_path: Path) -> None:
-    (tmp_path / "state.held.json").write_text('{"form": 1, "held": {"hmi/limit": 51}}')
+async def test_a_held_value_outside_new_limits_or_without_retain_is_dropped(tmp_path: Path) -> None:
+    held = '{"form": 1, "held": {"hmi/limit": 51, "hmi/name": "AB"}}'
+    (tmp_path / "state.held.json").write_text(held)
     one = gateway(tmp_path)
     await served(one).begin()
-    assert one.sample(tag(one, "limit")).quality is Quality.BAD
+    for name in ("limit", "name"):
+        assert one.sample(tag(one, name)).quality is Quality.BAD
 
 
 async def test_direct_access_sends_nothing_on_the_wire_of_a_master(tmp_path: Path) -> None:

@@ -54,6 +54,15 @@ def test_a_read_shows_the_echo_before_any_write(delay: float) -> None:
     assert [one for _, one in on_the_wire(made, requests, delay)] == [VALUE] + [WRITE] * 5
 
 
+def test_the_fastest_echo_counts_where_delays_differ() -> None:
+    made = bench()
+    for delay in (0.02, 0.3):
+        assert made.ask(READ, after=5) == VALUE
+        assert made.ask(VALUE, after=delay) == b""
+    assert made.ask(WRITE, after=5) == WRITE
+    assert made.ask(WRITE, after=0.02) == b""
+
+
 def test_echoes_on_their_way_keep_their_order() -> None:
     """The master writes on after each reply: no value of before is written again."""
     made, other = bench(), rtu("01 06 0004 0009")

@@ -127,6 +127,13 @@ def test_two_bytes_of_noise_before_or_behind_a_request_do_no_harm() -> None:
     assert made.ask(READ + b"\x00\xff") == VALUE
 
 
+def test_noise_is_skipped_after_a_silence_only() -> None:
+    made = bench()
+    assert made.ask(READ) == VALUE
+    assert made.ask(b"\xff\x00" + READ, after=0.01) == VALUE  # no pause that begins all again
+    assert made.ask(b"\xff" + READ, after=0.001) == b""
+
+
 def test_a_request_that_another_follows_is_neither_done_nor_answered() -> None:
     """The master no longer waits, and would take the reply for that to its next request."""
     made = bench()

@@ -142,6 +142,7 @@ def test_what_a_silent_master_wrote_turns_bad_until_it_writes_again() -> None:
     assert made.online_given == [("hmi", True), ("hmi", True)]
     ask(made, "06 0064 0008")
     assert ask(made, "03 0064 0001") == "03 02 00 08"
+    assert (station.counts.requests, station.counts.writes) == (4, 2)
 
 
 def test_a_lost_port_turns_what_the_master_wrote_bad() -> None:

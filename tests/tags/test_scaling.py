@@ -95,19 +95,19 @@ def test_the_limit_of_a_json_number(
 
 
 @pytest.mark.parametrize(
-    ("kind", "scale", "type_"),
+    ("kind", "scale", "offset", "type_"),
     [
-        ("bcd16", 5, "uint16"),  # 9999 x 5
-        ("bcd16", 7, "int32"),
-        ("int8", 100, "int32"),  # -12800 to 12700
-        ("int16", -1, "int32"),
-        ("bcd32", 20, "int32"),
-        ("bcd32", 0.1, "float64"),
-        ("uint64", 2, "float64"),
+        ("bcd16", 5, 0, "uint16"),  # 9999 x 5
+        ("bcd16", 1, 55_537, "int32"),  # 65536
+        ("int8", 100, 0, "int32"),  # -12800 to 12700
+        ("int16", -1, 0, "int32"),
+        ("bcd32", 20, 0, "int32"),
+        ("bcd32", 0.1, 0, "float64"),
+        ("uint64", 2, 0, "float64"),
     ],
 )
-def test_the_type_of_a_scaled_value(kind: str, scale: float, type_: str) -> None:
-    assert tag(kind, scale=scale).value_type == type_
+def test_the_type_of_a_scaled_value(kind: str, scale: float, offset: int, type_: str) -> None:
+    assert tag(kind, scale=scale, offset=offset).value_type == type_
 
 
 def test_a_whole_scale_and_offset_keep_an_integer() -> None:
