@@ -1,10 +1,15 @@
 """Modbus TCP stations of the gateway, without a connection."""
 
+import asyncio
+from typing import cast
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.parts.serving.conversation import Conversation
 from gateway.tags import Quality, Reason
+from gateway.transport import Port
 from tests.serving.bench import Bench
 
 TAGS = {
@@ -170,6 +175,25 @@ def test_requests_in_one_piece_and_in_many_are_all_answered() -> None:
     assert made.ask(one + two).hex() == "000100000006010600640001" + "0002000000050103020001"
     replies = b"".join(made.ask(bytes((byte,))) for byte in one + two)
     assert len(replies) == 23
+
+
+class Closed(list[bytes]):
+    """A port that keeps what is written."""
+
+    write = list.append
+
+    async def close(self) -> None:
+        self.append(b"closed")
+
+
+async def test_what_arrives_after_the_end_of_a_connection_is_neither_done_nor_answered() -> None:
+    made, port = bench(), Closed()
+    talk = Conversation(made.line, network=True)
+    talk.opened(cast(Port, port))
+    for data in (b"GET / HTTP/1.1\r\n\r\n", bytes.fromhex("0001 0000 0006 01 06 0064 0007")):
+        talk.received(data)
+    await asyncio.sleep(0)
+    assert (port, made.written) == ([b"closed"], [])
 
 
 def test_bytes_that_are_no_modbus_end_the_connection() -> None:
