@@ -75,13 +75,15 @@ async def test_a_station_that_returns_is_seen_soon_and_a_write_waits_for_no_sile
 
 
 async def _is_seen_soon(folder: Path) -> None:
-    """Its turnaround is another one: each probe got its sound reply too late, but each 16th."""
-    async with with_a_silent_one(folder, "500ms") as (stations, client):
+    """Its turnaround is another one: each probe got its sound reply too late, but each 16th. A
+    neighbour needs the wire before a patient probe would end."""
+    async with with_a_silent_one(folder, "500ms", "300ms") as (stations, client):
         values = await client.subscribe("plant/b/w0")
         stations.slow[SILENT], since = 0.25, len(stations.heard)
         stations.silent.clear()
         await values.next(is_good)
         assert stations.asked(SILENT, since) < 15
+        assert stations.asked(HEALTHY, since) < 20
 
 
 async def _write_waits_for_none(folder: Path) -> None:
@@ -103,13 +105,13 @@ async def _write_waits_for_none(folder: Path) -> None:
 
 @asynccontextmanager
 async def with_a_silent_one(
-    folder: Path, reply_timeout: str
+    folder: Path, reply_timeout: str, every: str = "1h"
 ) -> AsyncIterator[tuple[Stations, ZenohPeer]]:
     """Device `b` has replied before, and is offline."""
     folder.mkdir()
     stations = Stations(lambda n: n < 100)
     timing = {"reply_timeout": reply_timeout, "late_guard": "50ms", "retries": 0}
-    devices = {"a": device(HEALTHY, "1h", **timing), "b": device(SILENT, "300ms", **timing)}
+    devices = {"a": device(HEALTHY, every, **timing), "b": device(SILENT, "300ms", **timing)}
     devices["a"]["tags"]["w0"]["write"] = True
     async with program_on(stations, folder, devices) as (program, client):
         values = await client.subscribe("plant/*/w0")

@@ -331,6 +331,17 @@ def test_a_device_that_fails_does_not_hold_up_the_others_twice_in_a_row() -> Non
     assert isinstance(schedule.next(1.0), Probe)
 
 
+def test_meanwhile_a_device_that_is_left_alone_is_not_polled_in_its_place() -> None:
+    failing, alone, other = online(0), online(0, station=2), online(0, station=3)
+    schedule = Schedule([failing, alone, other], 0.0)
+    fail(failing)
+    schedule.failed(1.5, 1.0)
+    jobs = [
+        schedule.next(1.5, lambda one, now: now + 1.0 if one is alone else now) for _ in range(2)
+    ]
+    assert [job.device for job in jobs if not isinstance(job, Idle)] == [other, failing]
+
+
 def test_an_offline_device_is_only_probed_at_growing_pauses() -> None:
     dev = online(0)
     schedule = Schedule([dev], 0.0)
@@ -385,6 +396,20 @@ def test_a_long_probe_that_waits_for_its_share_holds_up_no_short_one_that_fits()
     job = schedule.next(5.01)
     assert isinstance(job, Probe)
     assert (job.device, job.timeout) == (offline, UNKNOWN)
+
+
+def test_a_station_that_replied_behind_a_short_probe_gets_a_patient_one_beside_due_polls() -> None:
+    """Once: behind that one it is later than `reply_timeout`, and waits for its share."""
+    healthy, back = online(0, every=0.1), online(0, station=2)
+    schedule = Schedule([healthy, back], 0.0)
+    fail(back)
+    schedule.went_offline(back, 0.0, 5.0)
+    back.health.probes.sent(short=True)
+    for is_sent in (True, False):
+        back.health.spoke(2.0, back.longest_reply)
+        job = schedule.next(2.0)
+        assert isinstance(job, Probe if is_sent else PollEntry)
+        assert not isinstance(job, Probe) or (job.device, job.timeout) == (back, None)
 
 
 def test_one_offline_unit_of_a_network_gets_less_than_all_together() -> None:

@@ -111,11 +111,6 @@ class Device:
         return self.health.state
 
     @property
-    def is_known(self) -> bool:
-        """False while it is not certain that it is the device of the file."""
-        return self.identity is None or self.identity.is_usable
-
-    @property
     def polled_tags(self) -> list[Tag]:
         """The tags that polls read."""
         areas = self.driver.areas
@@ -268,7 +263,7 @@ class Device:
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
-        self.turnaround.replan(self._longest_at_first)
+        self.turnaround.replan(*self._as_planned)
         self.good_reads.replan()
         bad.changed.clear()
         if self.shapes is not None:
@@ -305,17 +300,19 @@ class Device:
         self.good_reads.replan()
         found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
-        self.turnaround.replan(self._longest_at_first)
+        self.turnaround.replan(*self._as_planned)
         if self.shapes is not None:
             self.shapes.longer.planned(self.blocks)
         return self.planning_seconds(tags)
 
     @property
-    def _longest_at_first(self) -> float:
-        """Seconds of its longest poll at the turnaround of the file, as `check` says it."""
-        given, times = self.settings.turnaround, self.window * self.settings.verify_reads
-        polls = (self.wire.transaction(one.cost, self.timing, given) for one in self.blocks)
-        return times * max(polls, default=math.inf)
+    def _as_planned(self) -> tuple[float, float]:
+        """Seconds of its longest transaction of polls, and its share of the wire, at the turnaround
+        of the file, as `check` says it."""
+        given, reads = self.settings.turnaround, self.settings.verify_reads
+        polls = [reads * self.wire.transaction(one.cost, self.timing, given) for one in self.blocks]
+        load = sum(took / one.every for took, one in zip(polls, self.blocks, strict=True))
+        return self.window * max(polls, default=math.inf), load
 
     @property
     def _monitored(self) -> bool:

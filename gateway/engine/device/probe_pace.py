@@ -75,6 +75,12 @@ class ProbePace:
         replies are damaged is no victim of noise, and takes no more of the wire than a dead one."""
         return self.is_alive(now) and now - self._damaged_since < HOPE_FOR
 
+    @property
+    def is_back(self) -> bool:
+        """True if it replied behind a short probe: the patient one that is next will be answered,
+        unless it is later than `reply_timeout`."""
+        return self.patient and not self._waited
+
     def was_late(self, now: float) -> bool:
         """Returns True if a reply of the device came late in the last minute."""
         return now - self._last_late < LATE_FOR

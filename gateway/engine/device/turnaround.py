@@ -10,8 +10,8 @@ LEARN_EVERY = 50  # requests between two comparisons with the measured turnaroun
 # Seconds: plans expect no shorter one. Less wire time than this is not worth another request, nor
 # a new plan while the times of a fast network vary.
 SHORTEST = 0.001
-SMOOTHED = 0.95  # of the longest poll, for each one after it
-SLOW = 3.0  # times the planned seconds of a poll
+SMOOTHED = 0.99  # of the longest poll, for each one after it
+SLOW, AS_PLANNED = 2.0, 1.5  # times the planned seconds of a poll: from here on, up to here
 MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
 
 
@@ -21,7 +21,8 @@ class Turnaround:
 
     configured: float | None
     expected: float | None = field(init=False)  # None: the default of the protocol
-    planned_poll: float = math.inf  # of the longest poll, as the file says it
+    planned_poll: float = math.inf  # of the longest poll, as the file says it,
+    planned_load: float = 0.0  # and the share of the wire of all polls
     slow: float = 0.0  # of the last good poll, if it took much longer than the plan says
     gives_way: bool = False  # since then it waited while others needed the wire
     look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
@@ -73,7 +74,7 @@ class Turnaround:
 
     def took(self, seconds: float) -> bool:
         """Notes the time of a good poll. Returns True if it is much longer than the plan says."""
-        slow = seconds > SLOW * self.planned_poll
+        slow = seconds > (AS_PLANNED if self.slow else SLOW) * self.planned_poll
         self.slow = max(seconds, SMOOTHED * self.slow) if slow else 0.0
         self.gives_way = self.gives_way and slow
         return self.slow > 0.0
@@ -82,10 +83,11 @@ class Turnaround:
         """Notes that its poll waits for those of others."""
         self.gives_way = True
 
-    def replan(self, longest_poll: float) -> None:
+    def replan(self, longest_poll: float, load: float) -> None:
         """Forgets what holds for the tags and addresses of the last plan only.
 
-        `longest_poll`: seconds of the longest one of the new plan, at the turnaround of the file.
+        `longest_poll`, `load`: seconds of the longest one of the new plan, and the share of the
+        wire of all, at the turnaround of the file.
         """
-        self.planned_poll = longest_poll
+        self.planned_poll, self.planned_load = longest_poll, load
         self._fewest = None

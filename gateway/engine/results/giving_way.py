@@ -15,14 +15,17 @@ from gateway.engine.schedule.schedule import Schedule
 SHARE = 0.01  # of the time for which polls of others may be late because of such devices
 LONGEST = 60.0  # seconds without a poll, at most: it may be as quick as before
 AGAIN = 0.02  # seconds: not sooner is it asked again if the others have time now
+SEVERAL, MOST = 8, 16  # transactions without a good value
 GAP = 0.02  # seconds without a byte after which it has ended what it says
 
 
 class _Worthless(NamedTuple):
-    """A device that is online, and has no good value."""
+    """An online device whose transactions hardly bring a good value."""
 
     since: float
-    took: float  # the longest of its transactions, smoothed
+    reads: int  # good ones so far
+    score: int  # transactions that brought none, less those that others make up for
+    took: float  # the longest of them, smoothed
 
 
 class GivingWay(Rule):
@@ -31,7 +34,7 @@ class GivingWay(Rule):
 
     The plan is that of the file, as `check` prints it. A line that is asked for more than it
     carries has no plan that it can keep: there each device gets its share. A device that replies,
-    but has had no good value for long, gives way there, too. After it the wire must be quiet: it
+    but has had hardly a good value for long, gives way, too. After it the wire must be quiet: it
     may say more than its reply.
     """
 
@@ -64,54 +67,58 @@ class GivingWay(Rule):
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         device = job.device
-        if device.health.online and not self._has_good(device):
-            since, took = self._worthless.get(device, (now, 0.0))
+        if device.health.online:
+            reads = self._good_reads(device)
+            since, before, score, took = self._worthless.get(device, (now, reads, 0, 0.0))
+            score = min(score + 1, MOST) if reads == before else max(score - SEVERAL, 0)
             took = max(now - self._in_flight.begun, took * SMOOTHED)
-            self._worthless[device] = _Worthless(since, took)
-        elif self._worthless:
+            self._worthless[device] = _Worthless(since if score else now, reads, score, took)
+        else:
             self._worthless.pop(device, None)
         if not self.takes(device, now):
             return
         if not device.is_slow:
             self._quiet_at, self._quiet_by = now + GAP, now + device.settled_after
         late, every = self._late_by(device, 0.0, now)
-        if late > 0.0:  # a poll that late leaves a period out
-            self._lane = now + min((late + every) / SHARE, LONGEST)
+        took = now - self._in_flight.begun
+        if late > 0.0:  # a poll so late leaves a period out, if it was not late before
+            cost = took if late > took else late + every
+            self._lane = now + min(cost / SHARE, LONGEST)
 
     def received(self, data: bytes, now: float, time: int) -> None:
         if now < self._quiet_at:
             self._quiet_at = min(now + GAP, self._quiet_by)
 
-    def _has_good(self, device: Device) -> bool:
-        return any(poll.reads.at is not None for poll in self._schedule.polls(device))
+    def _good_reads(self, device: Device) -> int:
+        return sum(poll.reads.count for poll in self._schedule.polls(device))
 
     def takes(self, device: Device, now: float) -> float:
         """Returns the seconds of a poll of the device, if it must give way; 0: it need not."""
         if device.is_slow:
             return device.turnaround.slow
-        if device not in self._worthless or self._has_good(device):
+        known = self._worthless.get(device)
+        if known is None or known.score < SEVERAL or now - known.since < HOPE_FOR:
             return 0.0
-        since, took = self._worthless[device]
-        return took if now - since >= HOPE_FOR else 0.0
+        return known.took if known.reads == self._good_reads(device) else 0.0
 
     def _late_by(self, device: Device, took: float, now: float) -> tuple[float, float]:
         """Returns the seconds by which a poll of another device is late after one that takes so
-        long, and its interval."""
-        end, work, load = now + took, 0.0, 0.0
+        long, and its interval. On a line that is asked for more than it carries none is."""
+        if sum(one.turnaround.planned_load for one in self._devices) > 1.0:
+            return 0.0, 0.0
+        end, work = now + took, 0.0
         deadline, every = end + LONGEST, 0.0
         for other in self._devices:
-            if not other.health.online or self.takes(other, now):
+            if other is device or not other.health.online or self.takes(other, now):
                 continue
             proof = other.settled_after if other.is_doubtful else 0.0
             for poll in self._schedule.polls(other):
-                seconds = other.seconds(poll.block.cost) * other.settings.verify_reads + proof
-                load += seconds / poll.block.every
                 if poll.due <= end:
-                    work += seconds
+                    seconds = other.seconds(poll.block.cost) * other.settings.verify_reads
+                    work += seconds + proof
                     if poll.deadline < deadline:
                         deadline, every = poll.deadline, poll.block.every
-        overloaded = load > 1.0 and device.is_slow
-        return 0.0 if overloaded else end + work - deadline, every
+        return end + work - deadline, every
 
     def opened(self, now: float) -> None:
         self._lane = self._quiet_at = now

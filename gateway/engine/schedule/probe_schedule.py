@@ -89,6 +89,8 @@ class ProbeSchedule:
         health, urgent = device.health, device.health.probes.is_urgent(now)
         if urgent:  # its damaged replies show that the wire is the trouble
             return self.probe(device, now) if idle_until > now or self.failing_lane <= now else None
+        if health.probes.is_back:
+            return self.probe(device, now, patient=True)
         if idle_until <= now < self._offline_lane:
             return None
         short = short_timeout(device, self._devices)

@@ -229,7 +229,7 @@ class Schedule:
             if isinstance(probe, Probe):
                 return probe
             until = min(until, probe)
-        return self._next_poll(now) if due else Idle(until)
+        return self._next_poll(now, free) if due else Idle(until)
 
     def _held(self, free: Callable[[Device, float], float], now: float) -> bool:
         """Returns True if a poll that goes first is put off, because its device is left alone."""
@@ -267,7 +267,9 @@ class Schedule:
             return request
         return None if due else self._probes.probe(first, now)
 
-    def _next_poll(self, now: float) -> PollEntry | Probe:
+    def _next_poll(
+        self, now: float, free: Callable[[Device, float], float] | None
+    ) -> PollEntry | Probe:
         queue = self._queue
         poll = queue.due
         first = queue.expedited and not self._expedited and self._may_expedite(now, now)
@@ -279,7 +281,8 @@ class Schedule:
         if shapes is not None and shapes.mark_due <= now < shapes.at + shapes.quiet:
             poll.device.health.left_outstanding(shapes.span, now)
         if poll.device.health.needs_resync:
-            other = self._first_without_resync() if now < self._probes.failing_lane else None
+            waits = now < self._probes.failing_lane
+            other = self._first_without_resync(now, free) if waits else None
             if other is None:
                 return self._probes.probe(poll.device, now)
             poll = other
@@ -304,11 +307,15 @@ class Schedule:
         """Returns more due polls of the device. `held`: polls that have not ended yet."""
         return [other.hand_out(now) for other in self._queue.more(device, most, held)]
 
-    def _first_without_resync(self) -> PollEntry | None:
-        """Returns the due poll with the earliest deadline whose device needs no resync, and is
-        the one of the file."""
+    def _first_without_resync(
+        self, now: float, free: Callable[[Device, float], float] | None
+    ) -> PollEntry | None:
+        """Returns the due poll with the earliest deadline whose device needs no resync, and may be
+        polled now."""
         devices = {poll.device for poll in self._queue.valid()}
-        good = {one for one in devices if one.is_known and not one.health.needs_resync}
+        good = {one for one in devices if not one.health.needs_resync}
+        if free is not None:
+            good = {one for one in good if free(one, now) <= now}
         ready = (poll for poll in self._queue.valid() if poll.device in good)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
