@@ -108,7 +108,8 @@ class Engine:
         elif isinstance(job, Idle):
             asked = rules.troubled or rules.asked_always
             wakes = [wake(now) for wake in rules.wake] if asked else ()
-            return Idle(min(job.until, *wakes)) if wakes else job
+            # A rule may have the line wait although another one is due.
+            return Idle(min([job.until, *(at for at in wakes if at > now)])) if wakes else job
         elif isinstance(job, Reopen):
             return job
         else:
