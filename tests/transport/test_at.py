@@ -199,6 +199,15 @@ def test_a_ring_is_answered() -> None:
     assert bench.model.commands[-1] == "ATA"
 
 
+def test_other_words_of_a_modem_that_waits_are_no_ring() -> None:
+    bench = Bench(answers=True)
+    bench.open()
+    before = list(bench.model.commands)
+    bench.hear(b"\r\n+CREG: 1\r\n\r\nCID: 26204393\r\n")
+    assert bench.run(10) == []
+    assert bench.model.commands == before
+
+
 def test_a_caller_who_says_nothing_is_hung_up() -> None:
     bench = Bench(answers=True)
     bench.open()

@@ -86,6 +86,22 @@ async def test_programs_open_it_one_after_another_by_the_same_name(tmp_path: Pat
             assert "has closed it" in str(one.program.losses[0])
 
 
+async def test_a_program_that_sets_nothing_gets_all_bytes_as_they_are(tmp_path: Path) -> None:
+    every = bytes(range(256))
+    async with served(tmp_path / "hall-1") as programs:
+        with (tmp_path / "hall-1").open("r+b", buffering=0) as file:
+            async with asyncio.timeout(PATIENCE):
+                program = await programs.get()
+            file.write(every)
+            await program.until(lambda found: len(found.data) >= 256)
+            assert program.data == every
+            program.port.write(every)
+            heard = b""
+            while len(heard) < 256:
+                heard += await asyncio.to_thread(file.read, 256) or b""
+            assert heard == every
+
+
 @pytest.mark.parametrize(("bits", "parity"), [(7, "E"), (8, "E"), (7, "O"), (8, "N")])
 async def test_any_format_opens_again_and_again(tmp_path: Path, bits: int, parity: str) -> None:
     async with served(tmp_path / "hall-1") as programs:
