@@ -163,12 +163,6 @@ class Engine:
             charged = self._charged
             if charged is not None and (len(self.devices) > 1 or not isinstance(charged, Device)):
                 charged.used(now, in_flight.begun)
-                if (
-                    good
-                    and isinstance(job, Poll)
-                    and job.device.turnaround.took(now - in_flight.begun)
-                ):
-                    self.rules.troubled.add(job.device)
         effects, self._effects.collected = self._effects.collected, []
         if not good or len(effects) != 1 or self.deadline <= now:
             self._set_deadline()  # a good end alone makes it no earlier
@@ -216,6 +210,11 @@ class Engine:
         own = not (traffic.doubtful and device.is_doubtful) or isinstance(job, Probe)
         exchanges, turnaround = traffic.exchanges, traffic.turnaround
         device.record.count_exchanges(exchanges, characters, turnaround, traffic.ahead, own=own)
+        if turnaround > device.turnaround.slow_to:
+            if device.turnaround.replied(turnaround):
+                rules.troubled.add(device)
+        elif exchanges and device.is_slow:
+            device.turnaround.replied(turnaround)
         if device.shapes is not None:
             device.shapes.at = now
 

@@ -18,7 +18,7 @@ from gateway.engine.device.records import QUICKEST_OF
 from gateway.engine.device.reply_shapes import WARY_FOR
 from gateway.engine.device.second_requests import MOST_SILENT
 from gateway.engine.device.station_silence import FORGOTTEN_AFTER
-from gateway.engine.device.turnaround import LEARN_EVERY, SLOW
+from gateway.engine.device.turnaround import LEARN_EVERY
 from gateway.engine.device.twins import FOR
 from gateway.engine.jobs.poll_entry import OWED
 from gateway.engine.jobs.unanswered import SEEN_FOR
@@ -179,8 +179,8 @@ BELIEFS = (
     ),
     Belief(
         "a device takes more of the wire than planned",
-        f"its last good poll took {SLOW:g} times as long as planned",
-        "a poll that does not; it is polled after a minute at the latest",
+        "its last turnaround was longer than planned by a whole poll",
+        "one that is not, by half a poll; it is polled after a minute at the latest",
         "its polls go when they are due",
         LONGEST_WAY,
     ),

@@ -354,9 +354,9 @@ def busy() -> Way:
 def takes_more_than_planned() -> Way:
     device = link_device()
     for _ in range(int(HOUR)):
-        device.turnaround.took(10 * device.turnaround.planned_poll)
+        device.turnaround.replied(10 * device.turnaround.planned_poll)
     assert device.is_slow
-    device.turnaround.took(device.turnaround.planned_poll)
+    device.turnaround.replied(device.timing.turnaround)
     return lambda _: not device.is_slow
 
 

@@ -306,13 +306,14 @@ class Device:
         return self.planning_seconds(tags)
 
     @property
-    def _as_planned(self) -> tuple[float, float]:
-        """Seconds of its longest transaction of polls, and its share of the wire, at the turnaround
-        of the file, as `check` says it."""
+    def _as_planned(self) -> tuple[float, float, float]:
+        """Its turnaround, the seconds of its longest transaction of polls, and its share of the
+        wire, as the file and `check` say it."""
         given, reads = self.settings.turnaround, self.settings.verify_reads
         polls = [reads * self.wire.transaction(one.cost, self.timing, given) for one in self.blocks]
         load = sum(took / one.every for took, one in zip(polls, self.blocks, strict=True))
-        return self.window * max(polls, default=math.inf), load
+        turnaround = self.timing.turnaround if given is None else given
+        return turnaround, self.window * max(polls, default=math.inf), load
 
     @property
     def _monitored(self) -> bool:
@@ -438,7 +439,7 @@ class Device:
 
     @property
     def is_slow(self) -> bool:
-        """True if its last poll took much longer than the plan says."""
+        """True if its last reply took much longer than the plan says."""
         return self.turnaround.slow > 0.0
 
     def used(self, now: float, begun: float) -> None:

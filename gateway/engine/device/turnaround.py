@@ -11,7 +11,7 @@ LEARN_EVERY = 50  # requests between two comparisons with the measured turnaroun
 # a new plan while the times of a fast network vary.
 SHORTEST = 0.001
 SMOOTHED = 0.99  # of the longest poll, for each one after it
-SLOW, AS_PLANNED = 2.0, 1.5  # times the planned seconds of a poll: from here on, up to here
+SLOW, AS_PLANNED = 1.0, 0.5  # of a poll, that a turnaround is longer than planned
 MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
 
 
@@ -23,7 +23,9 @@ class Turnaround:
     expected: float | None = field(init=False)  # None: the default of the protocol
     planned_poll: float = math.inf  # of the longest poll, as the file says it,
     planned_load: float = 0.0  # and the share of the wire of all polls
-    slow: float = 0.0  # of the last good poll, if it took much longer than the plan says
+    slow_from: float = math.inf  # a longer turnaround is as long as a whole poll,
+    slow_to: float = math.inf  # or no longer than half of one
+    slow: float = 0.0  # of a poll, if the last turnaround was so much longer than planned
     gives_way: bool = False  # since then it waited while others needed the wire
     look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
     plan_from: int = 0  # number of requests from which on it may be planned again
@@ -72,22 +74,25 @@ class Turnaround:
             self._fewest = count()
         return self._fewest
 
-    def took(self, seconds: float) -> bool:
-        """Notes the time of a good poll. Returns True if it is much longer than the plan says."""
-        slow = seconds > (AS_PLANNED if self.slow else SLOW) * self.planned_poll
-        self.slow = max(seconds, SMOOTHED * self.slow) if slow else 0.0
+    def replied(self, turnaround: float) -> bool:
+        """Notes the turnaround of a reply. Returns True if polls take much longer than planned."""
+        slow = turnaround > (self.slow_to if self.slow else self.slow_from)
+        took = self.planned_poll + turnaround
+        self.slow = max(took, SMOOTHED * self.slow) if slow else 0.0
         self.gives_way = self.gives_way and slow
-        return self.slow > 0.0
+        return slow
 
     def give_way(self) -> None:
         """Notes that its poll waits for those of others."""
         self.gives_way = True
 
-    def replan(self, longest_poll: float, load: float) -> None:
+    def replan(self, turnaround: float, longest_poll: float, load: float) -> None:
         """Forgets what holds for the tags and addresses of the last plan only.
 
         `longest_poll`, `load`: seconds of the longest one of the new plan, and the share of the
-        wire of all, at the turnaround of the file.
+        wire of all, at this turnaround of the file.
         """
         self.planned_poll, self.planned_load = longest_poll, load
+        self.slow_from = turnaround + SLOW * longest_poll
+        self.slow_to = turnaround + AS_PLANNED * longest_poll
         self._fewest = None

@@ -7,7 +7,8 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.probe_pace import HOPE_FOR
 from gateway.engine.device.turnaround import SMOOTHED
-from gateway.engine.jobs.jobs import Idle, Result, Traffic, Transacted
+from gateway.engine.jobs.jobs import Idle, Poll, Result, Traffic, Transacted
+from gateway.engine.jobs.poll_entry import EXPEDITED
 from gateway.engine.results.rule import Rule
 from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.schedule import Schedule
@@ -15,17 +16,17 @@ from gateway.engine.schedule.schedule import Schedule
 SHARE = 0.01  # of the time for which polls of others may be late because of such devices
 LONGEST = 60.0  # seconds without a poll, at most: it may be as quick as before
 AGAIN = 0.02  # seconds: not sooner is it asked again if the others have time now
-SEVERAL, MOST = 8, 16  # transactions without a good value
+SEVERAL, MOST = 8, 16  # polls without a good value
 GAP = 0.02  # seconds without a byte after which it has ended what it says
 
 
 class _Worthless(NamedTuple):
-    """An online device whose transactions hardly bring a good value."""
+    """An online device whose polls hardly bring a good value."""
 
     since: float
     reads: int  # good ones so far
-    score: int  # transactions that brought none, less those that others make up for
-    took: float  # the longest of them, smoothed
+    score: int  # polls that brought none, less those that others make up for
+    took: float  # the longest of its transactions, smoothed
 
 
 class GivingWay(Rule):
@@ -58,7 +59,7 @@ class GivingWay(Rule):
         if self._lane <= now or not (took := self.takes(device, now)):
             return now
         late, _ = self._late_by(device, took, now)
-        if late <= 0.0:
+        if late <= 0.0 or self._is_asked(device):
             return now
         device.turnaround.give_way()
         return min(self._lane, now + max(late, AGAIN))
@@ -66,28 +67,37 @@ class GivingWay(Rule):
     def concluded(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
-        device = job.device
-        if device.health.online:
-            reads = self._good_reads(device)
-            since, before, score, took = self._worthless.get(device, (now, reads, 0, 0.0))
-            score = min(score + 1, MOST) if reads == before else max(score - SEVERAL, 0)
-            took = max(now - self._in_flight.begun, took * SMOOTHED)
-            self._worthless[device] = _Worthless(since if score else now, reads, score, took)
-        else:
+        device, took = job.device, now - self._in_flight.begun
+        if not device.health.online:
             self._worthless.pop(device, None)
+        elif isinstance(job, Poll):
+            self._polled(device, now)
+        if (known := self._worthless.get(device)) is not None:
+            longest = max(took, known.took * SMOOTHED)
+            self._worthless[device] = known._replace(took=longest)
         if not self.takes(device, now):
             return
-        if not device.is_slow:
+        if device.is_doubtful:
             self._quiet_at, self._quiet_by = now + GAP, now + device.settled_after
         late, every = self._late_by(device, 0.0, now)
-        took = now - self._in_flight.begun
         if late > 0.0:  # a poll so late leaves a period out, if it was not late before
             cost = took if late > took else late + every
             self._lane = now + min(cost / SHARE, LONGEST)
 
+    def _polled(self, device: Device, now: float) -> None:
+        """Counts a poll as one that brought no value, until the next one shows what it brought."""
+        reads = self._good_reads(device)
+        since, before, score, took = self._worthless.get(device, (now, reads, 0, 0.0))
+        score = min(score + 1, MOST) if reads == before else max(score - SEVERAL, 0)
+        self._worthless[device] = _Worthless(since if score else now, reads, score, took)
+
     def received(self, data: bytes, now: float, time: int) -> None:
         if now < self._quiet_at:
             self._quiet_at = min(now + GAP, self._quiet_by)
+
+    def _is_asked(self, device: Device) -> bool:
+        """Returns True if a client waits for one of its polls."""
+        return any(poll.ticket <= EXPEDITED for poll in self._schedule.polls(device))
 
     def _good_reads(self, device: Device) -> int:
         return sum(poll.reads.count for poll in self._schedule.polls(device))
