@@ -210,11 +210,10 @@ class Engine:
         own = not (traffic.doubtful and device.is_doubtful) or isinstance(job, Probe)
         exchanges, turnaround = traffic.exchanges, traffic.turnaround
         device.record.count_exchanges(exchanges, characters, turnaround, traffic.ahead, own=own)
-        if turnaround > device.turnaround.slow_to:
-            if device.turnaround.replied(turnaround):
-                rules.troubled.add(device)
-        elif exchanges and device.is_slow:
-            device.turnaround.replied(turnaround)
+        planned = device.turnaround
+        slow = turnaround > planned.slow_from or (exchanges and planned.slow)
+        if slow and planned.replied(turnaround):
+            rules.troubled.add(device)
         if device.shapes is not None:
             device.shapes.at = now
 
