@@ -33,10 +33,10 @@ class GivingWay(Rule):
     """A poll that takes longer than the plan of its device is sent if all polls of the others are
     in time nevertheless, and for a small share of the time if they are not.
 
-    The plan is that of the file, as `check` prints it. A line that is asked for more than it
-    carries has no plan that it can keep: there each device gets its share. A device that replies,
-    but has had hardly a good value for long, gives way, too. After it the wire must be quiet: it
-    may say more than its reply.
+    The plan is that of the file, as `check` prints it. Where the others leave no room for the plan
+    of the device, each gets its share: the line is asked for too much, or all are slow. A device
+    that replies, but has had hardly a good value for long, gives way, too. While extra replies
+    arrive, the wire must be quiet after it: it may say more than its reply.
     """
 
     always = False
@@ -113,22 +113,21 @@ class GivingWay(Rule):
 
     def _late_by(self, device: Device, took: float, now: float) -> tuple[float, float]:
         """Returns the seconds by which a poll of another device is late after one that takes so
-        long, and its interval. On a line that is asked for more than it carries none is."""
-        if sum(one.turnaround.planned_load for one in self._devices) > 1.0:
-            return 0.0, 0.0
-        end, work = now + took, 0.0
+        long, and its interval. Where the others leave no room for its plan, none is."""
+        end, work, load = now + took, 0.0, device.turnaround.planned_load
         deadline, every = end + LONGEST, 0.0
         for other in self._devices:
             if other is device or not other.health.online or self.takes(other, now):
                 continue
             proof = other.settled_after if other.is_doubtful else 0.0
             for poll in self._schedule.polls(other):
+                seconds = other.seconds(poll.block.cost) * other.settings.verify_reads
+                load += seconds / poll.block.every
                 if poll.due <= end:
-                    seconds = other.seconds(poll.block.cost) * other.settings.verify_reads
                     work += seconds + proof
                     if poll.deadline < deadline:
                         deadline, every = poll.deadline, poll.block.every
-        return end + work - deadline, every
+        return (0.0 if load > 1.0 else end + work - deadline), every
 
     def opened(self, now: float) -> None:
         self._lane = self._quiet_at = now
