@@ -150,6 +150,7 @@ async def test_a_flooding_station_costs_the_others_no_exchange_and_is_read_when_
         await asyncio.sleep(10 * MINUTE)
         assert all(kept(plant, other, since) > 1 - 2 * SHARE for other in others)
         assert failed == [sum(other.record.failures.values()) for other in others]
+        assert flooding.diagnosed().code == "answers-twice"
         station.answer = None
         await asyncio.sleep(LONGEST + 10.0)
         since = now()
@@ -171,7 +172,10 @@ def test_a_device_with_some_good_values_is_a_victim_of_noise(good: int, waits: b
         else:
             rule.concluded(entry.job, [0], REPLIED, at, 0)
             rig.engine.schedule.read(entry, [0] * entry.block.span.size, at, 0)
+        rig.devices[1].health.answered(resynced=True)
     assert bool(rule.takes(rig.device, 200.0)) is waits
+    assert (rule.free(rig.device, 200.0) > 200.0) is waits
+    assert not rig.device.turnaround.gives_way  # it is not slow
     rig.device.health.gave_up(200.0, 1.0)
     rule.concluded(entry.job, SPOILT, REPLIED, 200.0, 0)
     assert not rule.takes(rig.device, 200.0)  # its probes have their own share

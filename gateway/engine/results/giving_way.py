@@ -61,7 +61,8 @@ class GivingWay(Rule):
         late, _ = self._late_by(device, took, now)
         if late <= 0.0 or self._is_asked(device):
             return now
-        device.turnaround.give_way()
+        if device.is_slow:
+            device.turnaround.give_way()
         return min(self._lane, now + max(late, AGAIN))
 
     def concluded(
