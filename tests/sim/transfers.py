@@ -152,7 +152,9 @@ class Carrier:
         of all tags that are read together now."""
         source, read = row.source, self.judge.read_at
         beside = (t for t in read if (t.device, t.span.area) == (source.device, source.span.area))
+        own = read.get(source, self.judge.began)  # it may not have been read yet
         age = self.judge.now - min(map(read.__getitem__, beside), default=-math.inf)
+        age = max(age, self.judge.now - own)
         return age >= row.rule.stale - 2 * source.every  # the oldest may be late itself
 
     def _judge_value(self, row: Row, value: Value, *, fresh: bool) -> None:
