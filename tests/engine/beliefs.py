@@ -179,7 +179,7 @@ BELIEFS = (
     ),
     Belief(
         "a device takes more of the wire than planned",
-        "its last turnaround was longer than planned by a whole poll",
+        "its last turnaround was longer than that of the file, or at first, by a whole poll",
         "one that is not, by half a poll; it is polled after a minute at the latest",
         "its polls go when they are due",
         LONGEST_WAY,

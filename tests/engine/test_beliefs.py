@@ -13,6 +13,7 @@ from gateway.engine.device.identity import SILENT_TRIES, Identity, Verdict
 from gateway.engine.device.probe_pace import PROBE_PAUSE, PROBE_SPREAD
 from gateway.engine.device.records import QUICKEST_OF, Replies
 from gateway.engine.device.reply_shapes import ProofPace
+from gateway.engine.device.turnaround import LEARN_EVERY
 from gateway.engine.device.twins import Twins
 from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
 from gateway.engine.jobs.poll_entry import OWED, BlockReads
@@ -353,6 +354,9 @@ def busy() -> Way:
 
 def takes_more_than_planned() -> Way:
     device = link_device()
+    for _ in range(LEARN_EVERY):
+        device.record.count_exchanges(1, 0.01, device.timing.turnaround)
+    device.learn_turnaround()
     for _ in range(int(HOUR)):
         device.turnaround.replied(10 * device.turnaround.planned_poll)
     assert device.is_slow

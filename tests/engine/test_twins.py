@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gateway.engine.device.twins import FOR, KEPT, Twins
+from gateway.engine.device.twins import FOR, KEPT, LAST, Twins
 from gateway.errors import Refusal, Refused
 from tests.engine.test_proofs import doubtful, good, prove, read
 
@@ -22,6 +22,16 @@ def test_two_stations_answer_most_requests_twice_and_say_different_things() -> N
     answered(twins, KEPT // 2, 7)
     assert twins.exist(2.0)
     answered(twins, 1, 7)
+    assert not twins.exist(2.0)
+
+
+def test_half_of_the_last_few_requests_are_enough() -> None:
+    twins = Twins()
+    answered(twins, KEPT, 7)
+    answered(twins, LAST // 2, 7, 8)
+    answered(twins, LAST - LAST // 2, 8)  # alone
+    assert twins.exist(2.0)
+    answered(twins, 1, 8)
     assert not twins.exist(2.0)
 
 

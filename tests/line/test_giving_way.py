@@ -88,6 +88,18 @@ async def test_a_turnaround_of_the_file_is_a_part_of_the_plan() -> None:
 
 
 @on_virtual_time
+async def test_a_station_that_was_never_quicker_has_its_share() -> None:
+    plant = line()
+    plant.stations[0].late = lambda _: SLOW
+    async with running(plant):
+        await asyncio.sleep(2 * MINUTE)
+        since = now()
+        await asyncio.sleep(5 * MINUTE)
+        assert min(kept(plant, device, since) for device in plant.devices) > 0.2
+        assert not any(device.diagnosis() for device in plant.devices)
+
+
+@on_virtual_time
 async def test_all_stations_are_slow() -> None:
     plant = line()
     for station in plant.stations:

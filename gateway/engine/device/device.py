@@ -33,7 +33,7 @@ ANSWERS_TWICE = (
     "device server repeats replies"
 )
 GIVES_WAY = (
-    "A poll takes {slow:.2f} s, planned are {planned:.2f} s: it waits where others need the wire; "
+    "A poll takes {slow:.2f} s, usual are {planned:.2f} s: it waits where others need the wire; "
     "set `turnaround`"
 )
 ECHO_PROVEN_FOR = 2.0  # seconds after which an adapter may echo that did not before
@@ -263,7 +263,7 @@ class Device:
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
-        self.turnaround.replan(*self._as_planned)
+        self._set_norm()
         self.good_reads.replan()
         bad.changed.clear()
         if self.shapes is not None:
@@ -300,20 +300,17 @@ class Device:
         self.good_reads.replan()
         found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
-        self.turnaround.replan(*self._as_planned)
+        self._set_norm()
         if self.shapes is not None:
             self.shapes.longer.planned(self.blocks)
         return self.planning_seconds(tags)
 
-    @property
-    def _as_planned(self) -> tuple[float, float, float]:
-        """Its turnaround, the seconds of its longest transaction of polls, and its share of the
-        wire, as the file and `check` say it."""
-        given, reads = self.settings.turnaround, self.settings.verify_reads
-        polls = [reads * self.wire.transaction(one.cost, self.timing, given) for one in self.blocks]
+    def _set_norm(self) -> None:
+        """Notes how much of the wire its polls take, as long as it is as quick as at first."""
+        norm, reads = self.turnaround.norm, self.settings.verify_reads
+        polls = [reads * self.wire.transaction(one.cost, self.timing, norm) for one in self.blocks]
         load = sum(took / one.every for took, one in zip(polls, self.blocks, strict=True))
-        turnaround = self.timing.turnaround if given is None else given
-        return turnaround, self.window * max(polls, default=math.inf), load
+        self.turnaround.replan(self.window * max(polls, default=math.inf), load)
 
     @property
     def _monitored(self) -> bool:
@@ -338,7 +335,11 @@ class Device:
         """
         if self.record.exchanges < self.turnaround.look_at:
             return None
-        if not self.turnaround.learn(self.record) or self._planning_takes_long:
+        first = self.turnaround.norm is None
+        may_plan = self.turnaround.learn(self.record)
+        if first:
+            self._set_norm()
+        if not may_plan or self._planning_takes_long:
             return None
         gain = self._most_gain()
         if gain == 0.0 or gain < WORTH_WHILE * (load := self.load):
@@ -439,7 +440,7 @@ class Device:
 
     @property
     def is_slow(self) -> bool:
-        """True if its last reply took much longer than the plan says."""
+        """True if its last reply took much longer than the file or its first replies say."""
         return self.turnaround.slow > 0.0
 
     def used(self, now: float, begun: float) -> None:

@@ -21,11 +21,12 @@ class Turnaround:
 
     configured: float | None
     expected: float | None = field(init=False)  # None: the default of the protocol
-    planned_poll: float = math.inf  # of the longest poll, as the file says it,
+    norm: float | None = field(init=False)  # of the file, or of the first replies; None: too few
+    planned_poll: float = math.inf  # of the longest poll, with that one,
     planned_load: float = 0.0  # and the share of the wire of all polls
     slow_from: float = math.inf  # a longer turnaround is as long as a whole poll,
     slow_to: float = math.inf  # or no longer than half of one
-    slow: float = 0.0  # of a poll, if the last turnaround was so much longer than planned
+    slow: float = 0.0  # of a poll, if the last turnaround was so much longer than the norm
     gives_way: bool = False  # since then it waited while others needed the wire
     look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
     plan_from: int = 0  # number of requests from which on it may be planned again
@@ -34,7 +35,7 @@ class Turnaround:
     _fewest: float | None = None  # requests a second of any plan; None: not counted yet
 
     def __post_init__(self) -> None:
-        self.expected = self.configured
+        self.expected = self.norm = self.configured
         if self.configured is not None:
             self.look_at = math.inf
 
@@ -44,6 +45,7 @@ class Turnaround:
             return False
         self.look_at = record.exchanges + LEARN_EVERY
         self.expected = record.replies.turnaround
+        self.norm = self.expected if self.norm is None else self.norm
         return record.exchanges >= self.plan_from
 
     def change(self, default: float) -> float:
@@ -75,7 +77,7 @@ class Turnaround:
         return self._fewest
 
     def replied(self, turnaround: float) -> bool:
-        """Notes the turnaround of a reply. Returns True if polls take much longer than planned."""
+        """Notes the turnaround of a reply. Returns True if polls take much longer than before."""
         slow = turnaround > (self.slow_to if self.slow else self.slow_from)
         took = self.planned_poll + turnaround
         self.slow = max(took, SMOOTHED * self.slow) if slow else 0.0
@@ -86,13 +88,14 @@ class Turnaround:
         """Notes that its poll waits for those of others."""
         self.gives_way = True
 
-    def replan(self, turnaround: float, longest_poll: float, load: float) -> None:
+    def replan(self, longest_poll: float, load: float) -> None:
         """Forgets what holds for the tags and addresses of the last plan only.
 
         `longest_poll`, `load`: seconds of the longest one of the new plan, and the share of the
-        wire of all, at this turnaround of the file.
+        wire of all, at the norm.
         """
         self.planned_poll, self.planned_load = longest_poll, load
-        self.slow_from = turnaround + SLOW * longest_poll
-        self.slow_to = turnaround + AS_PLANNED * longest_poll
+        if self.norm is not None:
+            self.slow_from = self.norm + SLOW * longest_poll
+            self.slow_to = self.norm + AS_PLANNED * longest_poll
         self._fewest = None

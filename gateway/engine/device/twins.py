@@ -7,7 +7,7 @@ from typing import Any
 from gateway.errors import DeviceError
 
 Replied = tuple[Any, Callable[[Any], Any]]  # a reply, and what tells another reply to its request
-KEPT = 16  # requests
+KEPT, LAST = 16, 6  # requests
 FOR = 600.0  # seconds
 
 
@@ -53,4 +53,8 @@ class Twins:
 
     def exist(self, now: float) -> bool:
         """Returns True if two stations answer."""
-        return now - self._differed < FOR and 2 * sum(self._again) >= len(self._again)
+        if now - self._differed >= FOR:
+            return False
+        # The right one may miss some requests. So half of the last few count as well.
+        last = [*self._again][-LAST:]
+        return 2 * sum(self._again) >= len(self._again) or 2 * sum(last) >= LAST

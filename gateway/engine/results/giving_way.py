@@ -1,4 +1,4 @@
-"""A device that takes more of the wire than its plan says gives way to those that do not."""
+"""A device that takes more of the wire than before gives way to those that do not."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,11 +30,11 @@ class _Worthless(NamedTuple):
 
 
 class GivingWay(Rule):
-    """A poll that takes longer than the plan of its device is sent if all polls of the others are
-    in time nevertheless, and for a small share of the time if they are not.
+    """A poll that takes longer than planned is sent if all polls of the others are in time
+    nevertheless, and for a small share of the time if they are not.
 
-    The plan is that of the file, as `check` prints it. Where the others leave no room for the plan
-    of the device, each gets its share: the line is asked for too much, or all are slow. A device
+    The plan has the turnaround of the file, or of the first replies. Where the others leave no room
+    for it, each gets its share: the line is asked for too much, or all are slow. A device
     that replies, but has had hardly a good value for long, gives way, too. While extra replies
     arrive, the wire must be quiet after it: it may say more than its reply.
     """
