@@ -22,6 +22,7 @@ import structlog
 
 from gateway.engine.device.device import Device
 from gateway.engine.forecast import forecast
+from gateway.engine.results.giving_way import GAP
 from gateway.engine.schedule.probes import ONE_OFFLINE, seen_within
 from gateway.errors import GatewayError, Unclear
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
@@ -267,6 +268,7 @@ class Life:
                 continue
             # What is in flight may be a read that waits in vain, or for its proof.
             more = one.longest_reply if self.met(asked) or self.drawn.kind == "flooding" else 0.0
+            more += GAP if self.drawn.kind == "flooding" else 0.0  # then the wire must be quiet
             if (took := now() - asked) > most + more:
                 self.broke(
                     f"write of {value} to {one.name} took {took:.3f}, not {most + more:.3f} s"
