@@ -199,6 +199,7 @@ class Engine:
         if traffic.strange or (traffic.heard and isinstance(result, Unclear)):
             for other in self.devices:  # another computer may have registered a list
                 other.monitor.forget()
+        good = good and not traffic.strange
         if not good or rules.troubled:
             after = rules.after(device, good=good)
         else:

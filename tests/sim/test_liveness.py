@@ -20,6 +20,11 @@ def test_beside_a_station_that_is_broken_for_ever_all_others_live_on(kind: str, 
     assert story.counts["writes"] > 5
 
 
+def test_a_flood_behind_sound_replies_destroys_no_request_to_another_station() -> None:
+    """One write was not sent: all requests behind those to the flooding station were destroyed."""
+    assert run(1_500_201, 6 * SLICE).broken == []
+
+
 def test_the_cases_are_a_serial_line_and_a_network() -> None:
     found = [draw(seed, ["mute"]).plant.devices[0].driver.protocol for seed in (SERIAL, NETWORK)]
     assert found == ["modbus-ascii", "modbus-tcp"]

@@ -36,7 +36,8 @@ class GivingWay(Rule):
     The plan has the turnaround of the file, or of the first replies. Where the others leave no room
     for it, each gets its share: the line is asked for too much, or all are slow. A device
     that replies, but has had hardly a good value for long, gives way, too. While extra replies
-    arrive, the wire must be quiet after it: it may say more than its reply.
+    arrive, the wire must be quiet after it, and after more characters than those of a reply: it may
+    say more.
     """
 
     always = False
@@ -76,10 +77,11 @@ class GivingWay(Rule):
         if (known := self._worthless.get(device)) is not None:
             longest = max(took, known.took * SMOOTHED)
             self._worthless[device] = known._replace(took=longest)
-        if not self.takes(device, now):
-            return
-        if device.is_doubtful:
+        takes = self.takes(device, now)
+        if traffic.strange or (takes and device.is_doubtful):
             self._quiet_at, self._quiet_by = now + GAP, now + device.settled_after
+        if not takes:
+            return
         late, every = self._late_by(device, 0.0, now)
         if late > 0.0:  # a poll so late leaves a period out, if it was not late before
             cost = took if late > took else late + every
