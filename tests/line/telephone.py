@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from gateway.config import built
 from gateway.engine.device.device import Device
@@ -116,12 +116,22 @@ class Telephone:
         return self.line.write(self.device, tag, tag.encode(value), within)
 
 
+class WithLine(Protocol):
+    """A line and what surrounds it."""
+
+    @property
+    def line(self) -> Any: ...
+
+
+W = TypeVar("W", bound=WithLine)
+
+
 @asynccontextmanager
-async def running(far: Telephone) -> AsyncIterator[Telephone]:
+async def running(around: W) -> AsyncIterator[W]:
     """The line, until the end of the block."""
-    task = asyncio.create_task(far.line.run())
+    task = asyncio.create_task(around.line.run())
     try:
-        yield far
+        yield around
         assert not task.done()
     finally:
         task.cancel()

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from gateway.parts.serving.served_line import ServedLine
 from gateway.stations.served.station import ServedStation
 from gateway.tags import Quality, Sample
 from gateway.transport import ModemAddress, Port, PortAddress, Receiver, SerialSettings, open_modem
-from tests.line.telephone import Cable, now
+from tests.line.telephone import Cable, now, running
 from tests.serving.easy_link import frame
 from tests.sim.virtual import on_virtual_time
 from tests.transport.modem import ModemModel
@@ -93,15 +93,9 @@ class Caller:
 
 @asynccontextmanager
 async def ready(caller: Caller) -> AsyncIterator[Caller]:
-    task = asyncio.create_task(caller.line.run())
-    try:
+    async with running(caller):
         await asyncio.sleep(5)
         yield caller
-        assert not task.done()
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
 
 
 @on_virtual_time

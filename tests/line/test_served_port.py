@@ -1,8 +1,7 @@
 """A served line and its port: when each master is silent, and how the port is opened again."""
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from gateway.parts.serving.served_line import ServedLine
 from gateway.stations.served.station import ServedStation
 from gateway.tags import Sample
 from gateway.transport import Port, Receiver
-from tests.line.telephone import now
+from tests.line.telephone import now, running
 from tests.sim.virtual import on_virtual_time
 
 
@@ -64,22 +63,9 @@ class Hall:
         raise AssertionError(f"{device.name} has no master")
 
 
-@asynccontextmanager
-async def running() -> AsyncIterator[Hall]:
-    hall = Hall()
-    task = asyncio.create_task(hall.line.run())
-    try:
-        yield hall
-        assert not task.done()
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-
-
 @on_virtual_time
 async def test_each_master_is_silent_after_its_own_time() -> None:
-    async with running() as hall:
+    async with running(Hall()) as hall:
         await asyncio.sleep(9.9)
         assert hall.bad == []
         await asyncio.sleep(0.2)
@@ -90,7 +76,7 @@ async def test_each_master_is_silent_after_its_own_time() -> None:
 
 @on_virtual_time
 async def test_a_port_that_worked_is_closed_and_opened_again_at_once() -> None:
-    async with running() as hall:
+    async with running(Hall()) as hall:
         for _ in range(8):
             await asyncio.sleep(60)
             hall.ports[-1].receiver.lost(LineDown("unplugged"))
