@@ -101,6 +101,13 @@ BELIEFS = (
         FOR,
     ),
     Belief(
+        "two stations had its number a short time ago",
+        "two stations had it",
+        "ten minutes in which it was not known",
+        "an acknowledged write is done, and a refused one certainly not",
+        FOR,
+    ),
+    Belief(
         "takes one request at a time",
         "requests that were answered alone and not beside others",
         "a transaction in which all were answered; it is tried every hour",

@@ -125,14 +125,22 @@ def answers_twice() -> Way:
     return given_up
 
 
-def twins() -> Way:
+def _twins(is_given_up: Callable[[Twins, float], bool]) -> Way:
     known = Twins()
     for second in range(int(HOUR)):
         known.asked()
         known.replied((7, lambda frame: frame))
         known.arrived(8, float(second))
-    assert known.exist(HOUR)
-    return lambda after: not known.exist(HOUR - 1 + after)
+    assert not is_given_up(known, HOUR)
+    return lambda after: is_given_up(known, HOUR - 1 + after)
+
+
+def twins() -> Way:
+    return _twins(lambda known, now: not known.exist(now))
+
+
+def twins_before() -> Way:
+    return _twins(lambda known, now: not known.may_reply(now))
 
 
 def one_at_a_time() -> Way:
@@ -503,6 +511,7 @@ WAYS: dict[str, Callable[[], Way]] = {
     "a silence is too short": silence_too_short,
     "answers twice": answers_twice,
     "two stations have its number": twins,
+    "two stations had its number a short time ago": twins_before,
     "takes one request at a time": one_at_a_time,
     "refused address": refused_address,
     "a block may hold an address about which the device is silent": fell_silent,

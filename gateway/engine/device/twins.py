@@ -27,12 +27,12 @@ class Twins:
     Then a reply that came alone may be that of either.
     """
 
-    __slots__ = ("_again", "_differed", "_last")
+    __slots__ = ("_again", "_differed", "_known", "_last")
 
     def __init__(self) -> None:
         self._last: Replied | None = None
         self._again = deque[bool](maxlen=KEPT)  # of each request
-        self._differed = -FOR
+        self._differed = self._known = -FOR
 
     def asked(self) -> None:
         """Notes a request to the device."""
@@ -50,6 +50,8 @@ class Twins:
             self._again[-1] = True
             if frame != self._last[0]:
                 self._differed = now
+            if self.exist(now):
+                self._known = now
 
     def exist(self, now: float) -> bool:
         """Returns True if two stations answer."""
@@ -58,3 +60,8 @@ class Twins:
         # The right one may miss some requests. So half of the last few count as well.
         last = [*self._again][-LAST:]
         return 2 * sum(self._again) >= len(self._again) or 2 * sum(last) >= LAST
+
+    def may_reply(self, now: float) -> bool:
+        """Returns True if two stations answered in the last ten minutes: what a reply says may be
+        true of the other one only."""
+        return now - self._known < FOR

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
+from gateway.engine.device.reply_shapes import UNPROVEN, WARY
 from gateway.engine.effects import Effects, RequestEnded
 from gateway.engine.jobs.jobs import (
     Answer,
@@ -40,6 +41,7 @@ from gateway.tags import WriteResult
 
 BROADCAST_PAUSE = 0.1  # seconds
 _SHOWN = 3  # elements of an array that differ
+EITHER = "two stations have this number: nothing tells which of them replied"
 STOPPED = "the gateway stopped before the acknowledgement arrived; it may be done"
 
 
@@ -268,6 +270,9 @@ class RequestRules:
         self._effects.pause(device.turnaround.configured or BROADCAST_PAUSE)
 
     def _end(self, request: Request, outcome: Outcome, now: float) -> None:
+        if _is_of_either(request.device, outcome, now):
+            is_read = isinstance(request, Command) and request.span is not None
+            outcome = Busy(UNPROVEN) if is_read else Unclear(EITHER)
         if isinstance(request, Write):
             if request.long is not None and isinstance(outcome, GatewayError):
                 outcome = request.long.ended(outcome)
@@ -297,6 +302,17 @@ class RequestRules:
             for write in schedule.requests.waiting
             if isinstance(write, Write) and write.group is group
         )
+
+
+def _is_of_either(device: Device, outcome: Outcome, now: float) -> bool:
+    """Returns True for a reply that a second station with the number of the device may have sent.
+    Its refusal does not tell that the right one changed nothing."""
+    shapes = device.shapes
+    if shapes is None or shapes.quiet != WARY or not shapes.proofs.twins.may_reply(now):
+        return False
+    if isinstance(outcome, WriteResult):
+        return outcome.acknowledged
+    return isinstance(outcome, str | Refused)
 
 
 def result_of(
