@@ -40,7 +40,7 @@ from gateway.engine.results.request_rules import RequestRules
 from gateway.engine.results.rule import NEVER, Rules
 from gateway.engine.results.staleness import Staleness
 from gateway.engine.rules import LineState, rules_of
-from gateway.engine.schedule.in_flight import HeldRead, InFlight
+from gateway.engine.schedule.in_flight import MOST_CHARGED, HeldRead, InFlight
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import BadValue, Busy, Lent, LineDown, Superseded, Unclear
 from gateway.planning.wire_timing import WireTiming
@@ -138,6 +138,8 @@ class Engine:
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         in_flight = self._in_flight
+        if now - in_flight.begun > MOST_CHARGED:
+            in_flight.stood_still(now)
         if isinstance(job, Poll):
             good = not isinstance(result, Exception)
             self._note(job, result, traffic, now, time, good=good)
@@ -215,8 +217,10 @@ class Engine:
         slow = turnaround > planned.slow_from or (exchanges and planned.slow)
         if slow and planned.replied(turnaround):
             rules.troubled.add(device)
-        if device.shapes is not None:
-            device.shapes.at = now
+        if (shapes := device.shapes) is not None:
+            shapes.at = now
+            if shapes.quiet == WARY and traffic.sent:
+                shapes.proofs.twins.replied(traffic.replied, traffic.before)
 
     @property
     def was_answered(self) -> bool:

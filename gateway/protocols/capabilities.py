@@ -91,6 +91,14 @@ class StrayFrames(Protocol):
 
 
 @runtime_checkable
+class BehindGateway(Protocol):
+    """A driver of stations that a gateway on the network may poll for us."""
+
+    def is_absence(self, frame: Any) -> bool:
+        """Returns True if the gateway says with it that the station did not reply."""
+
+
+@runtime_checkable
 class LooseRefusals(Protocol):
     """A driver whose error replies name a request, and some devices name the wrong one."""
 

@@ -102,8 +102,8 @@ BELIEFS = (
     ),
     Belief(
         "two stations had its number a short time ago",
-        "two stations had it",
-        "ten minutes in which it was not known",
+        "two stations have it, and four of its last 16 requests had a new reply beside its own",
+        "ten minutes without this evidence",
         "an acknowledged write is done, and a refused one certainly not",
         FOR,
     ),

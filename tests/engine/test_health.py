@@ -161,6 +161,23 @@ def test_a_late_answer_of_any_device_of_the_line_ends_the_noise(late: int) -> No
     assert is_noisy(line[0], line, 61.1)
 
 
+@pytest.mark.parametrize(
+    ("absent", "waited", "due"), [(False, 3.0, 3.0), (True, 0.5, 5.5), (True, 9.0, 39.0)]
+)
+def test_a_gateway_that_waits_in_vain_for_a_station_is_asked_for_it_seldom(
+    absent: bool, waited: float, due: float
+) -> None:
+    """Meanwhile the other stations behind it had no replies."""
+    found = health(S.OFFLINE)
+    found.unanswered.add(SPAN, 0.0)
+    found.replied_to_older(waited, absent=absent)
+    assert found.probes.due == due
+    assert found.probes.may_be_sent(due)
+    assert not found.probes.may_be_sent(due - 0.1)
+    found.gave_up(waited, 1.0)
+    assert found.probes.due >= due
+
+
 def test_a_restart_needs_a_resync_and_keeps_the_outstanding_request() -> None:
     found, lost = health(S.FAILING), LineDown("unplugged")
     found.restart(lost)

@@ -258,6 +258,17 @@ def test_a_reply_much_later_than_others_may_be_that_to_another_read(turnaround: 
     assert good(rig) == (turnaround < 0.02)
 
 
+def test_a_few_replies_that_another_master_delayed_make_no_late_one_usual() -> None:
+    rig = doubtful(link_device(retries=0))
+    for turnaround in [0.005] * 20 + [0.3] * 4:
+        late_read(rig, turnaround)
+    late_read(rig, 0.1)
+    assert not good(rig)
+    for _ in range(30):  # it is slower now
+        late_read(rig, 0.1)
+    assert good(rig)
+
+
 def test_after_a_read_without_a_reply_the_next_reply_proves_nothing() -> None:
     """The station may be silent about that register, and the reply that of another master."""
     rig = doubtful(link_device(retries=0))

@@ -1,11 +1,12 @@
 """Results of polls and probes: what follows for the values, the plan, the log and the record."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from gateway.engine.device.device import SILENT_SHARE
+from gateway.engine.device.device import HALF_LIFE, SILENT_SHARE
 from gateway.engine.device.health import State
 from gateway.engine.device.probe_pace import PAUSE_LONGEST
 from gateway.engine.device.reply_shapes import QUIET
@@ -23,6 +24,7 @@ from gateway.engine.jobs.jobs import (
 from gateway.engine.jobs.requests import Write
 from gateway.engine.results.busy_devices import FIRST
 from gateway.engine.results.poll_rules import BUSY_PAUSE
+from gateway.engine.schedule.in_flight import MOST_CHARGED
 from gateway.errors import DeviceError, Evidence, Garbled, Refusal, Refused, Unsteady
 from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import plan
@@ -428,6 +430,18 @@ def test_a_poll_of_several_at_once_without_a_reply_turns_bad_after_its_own_retri
     assert bad
     assert {sample.tag for sample in bad} == {silent}
     assert rig.device.health.online
+
+
+def test_while_the_process_stood_still_no_device_used_the_wire() -> None:
+    """It would be polled behind all others for minutes, where they are late."""
+    rig = Rig(link_device(), link_device(station=2))
+    rig.bring(State.ONLINE)
+    job = rig.transacted()
+    rig.conclude(job, Resynced(9) if isinstance(job, Probe) else [7] * 6, took=3600.0)
+    while not isinstance(job := rig.transacted(), Poll):
+        rig.conclude(job, Resynced(9))
+    rig.conclude(job, [7] * job.span.size, took=3600.0)
+    assert job.device.use <= math.log2(2 * MOST_CHARGED) + rig.now / HALF_LIFE
 
 
 def test_replies_of_another_station_make_no_address_bad() -> None:

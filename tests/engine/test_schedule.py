@@ -182,6 +182,21 @@ def test_questions_that_hold_up_no_poll_get_the_rest_of_the_wire() -> None:
     assert questions(schedule, [asked], 10.0)[asked] * took > 0.8 * 10.0
 
 
+def test_while_the_process_stood_still_no_question_is_charged() -> None:
+    """After an hour others waited for three more."""
+    dev = online(0, 1000, every=0.01)
+    schedule = Schedule([dev], 0.0)
+    _, asked = schedule.polls(dev)
+    now, sent = 0.0, list[float]()
+    while now < 3700.0:
+        schedule.expedite(asked, on_demand=True)
+        poll = polled(schedule, now)
+        now += 3600.0 if poll is asked and not sent else 0.1
+        schedule.polled(poll, now)
+        sent += [now] if poll is asked else []
+    assert len(sent) > 100
+
+
 def test_a_poll_that_clients_ask_for_is_not_polled_less_than_without_them() -> None:
     schedule = Schedule([dev := fast_and_slow(every=1.0)], 0.0)
     _, *asked = schedule.polls(dev)
@@ -410,6 +425,15 @@ def test_a_station_that_replied_behind_a_short_probe_gets_a_patient_one_beside_d
         job = schedule.next(2.0)
         assert isinstance(job, Probe if is_sent else PollEntry)
         assert not isinstance(job, Probe) or (job.device, job.timeout) == (back, None)
+
+
+def test_while_the_process_stood_still_no_probe_is_charged() -> None:
+    """After four seconds none was sent for four minutes, after an hour for days."""
+    healthy, lost = online(0), online(0, station=2)
+    schedule = Schedule([healthy, lost], 0.0)
+    fail(lost)
+    schedule.went_offline(lost, 0.0, 3600.0)
+    assert schedule.reachable(lost, probe_seconds(lost) / OFFLINE_SHARE + PROBE_PAUSE)
 
 
 def test_one_offline_unit_of_a_network_gets_less_than_all_together() -> None:

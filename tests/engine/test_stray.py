@@ -11,8 +11,10 @@ from gateway.engine.schedule.in_flight import InFlight
 from gateway.engine.schedule.schedule import Schedule
 from gateway.protocols.computer_link.codec import Ack, Text
 from gateway.protocols.driver import Span
+from gateway.protocols.modbus.frame import Frame
+from gateway.protocols.modbus.mbap import MbapCodec
 from gateway.stations.computer_link import ComputerLinkStation
-from tests.engine.rig import link_device
+from tests.engine.rig import link_device, tcp_device
 from tests.sim.plant import device, words
 
 LIST = (Span("D", 0, 1),)
@@ -55,6 +57,26 @@ def test_a_stray_frame_of_another_station_is_neither_counted_nor_logged() -> Non
     line.stray.received(ON_DEMAND, 0.0, 0)
     assert [event.fields["device"] for event in line.log()] == ["plc1"]
     assert (dev.record.unasked, other.record.unasked) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("pdu", "alone", "due"),
+    [
+        (b"\x83\x0b", False, 33.0),
+        (b"\x83\x0a", False, 33.0),
+        (b"\x83\x02", False, 3.0),
+        (b"\x83\x0b", True, 3.0),
+    ],
+)
+def test_a_late_answer_of_a_gateway_says_if_the_station_is_there(
+    pdu: bytes, alone: bool, due: float
+) -> None:
+    dev = tcp_device()
+    line = StrayLine(dev) if alone else StrayLine(dev, link_device())
+    dev.health.gave_up(0.0, 1.0)
+    dev.health.left_outstanding(None, 0.0)
+    line.stray.received(MbapCodec().encode(Frame(1, pdu, 7)), 3.0, 0)
+    assert dev.health.probes.due == due
 
 
 def test_any_stray_byte_forgets_every_monitor_list() -> None:

@@ -9,7 +9,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.device.health import Health, State, diagnosis
 from gateway.engine.device.identity import Identity
 from gateway.engine.device.monitor_list import MonitorList
-from gateway.engine.device.records import Record
+from gateway.engine.device.records import LATE, SLOWER, Record
 from gateway.engine.device.reply_shapes import MOST_HELD, GoodReads, ReplyShapes, reply_shapes
 from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.device.turnaround import Turnaround
@@ -37,8 +37,6 @@ GIVES_WAY = (
     "set `turnaround`"
 )
 ECHO_PROVEN_FOR = 2.0  # seconds after which an adapter may echo that did not before
-# A reply is late from so many seconds on, at least, and from so many times the usual turnaround
-LATE, SLOWER = 0.02, 3.0
 QUIET_MARGIN = 0.05  # seconds that a station may take longer than usual
 PROOF_COST = Cost(20, 30)  # characters of a resync, about
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
@@ -124,7 +122,10 @@ class Device:
     @property
     def usual_turnaround(self) -> float | None:
         """Seconds of the station for a reply, measured or from the file; None: not known yet."""
-        measured, given = self.record.replies.turnaround, self.turnaround.configured
+        return self._usual(self.record.replies.turnaround)
+
+    def _usual(self, measured: float | None) -> float | None:
+        given = self.turnaround.configured
         return given if measured is None else max(measured, given or 0.0)
 
     @property
@@ -132,6 +133,12 @@ class Device:
         """Seconds of the station after which a reply is later than usual; None: not known yet."""
         usual = self.usual_turnaround
         return None if usual is None else max(LATE, SLOWER * usual)
+
+    def is_unusual(self, turnaround: float) -> bool:
+        """Returns True if it is longer than most. A few that another master delayed make no more
+        of them usual."""
+        usual = self._usual(self.record.replies.typical)
+        return usual is not None and turnaround > max(LATE, SLOWER * usual)
 
     def may_be_echo(self, turnaround: float, unproven: float) -> bool:
         """Returns True if a reply that equals its request may be its echo, although the adapter

@@ -258,11 +258,17 @@ class Health:
             self.unanswered.clear()
             self.restart()
 
-    def replied_to_older(self, now: float) -> None:
-        """Applies a frame of an offline device behind a network, which no request waits for."""
+    def replied_to_older(self, now: float, *, absent: bool = False) -> None:
+        """Applies a frame of an offline device behind a network, which no request waits for.
+
+        `absent`: a gateway there says that the device did not reply.
+        """
         if self.state is State.OFFLINE and self.unanswered.sent:
             sent = self.unanswered.sent.popleft()
-            self.probes.behind(now, now - sent, more=bool(self.unanswered.sent))
+            if absent and sent > self._asked_at:  # a probe: it asks for no silent address
+                self.probes.absent(now, now - sent)
+            else:
+                self.probes.behind(now, now - sent, more=bool(self.unanswered.sent))
 
     def spoke(self, now: float, longest_reply: float, *, alone: bool = False) -> None:
         """Notes a sound frame, perhaps of an offline device. `alone`: no other one is online."""

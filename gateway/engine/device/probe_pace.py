@@ -11,6 +11,7 @@ LATE_FOR = 60.0  # seconds for which a late reply shows that waiting for it is o
 LATE_MOST = 1.0  # seconds by which a reply is known to be late, at most: another master may ask
 PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
 PROBE_SPREAD = 0.1  # share by which it varies
+ABSENT_PAUSE = 10.0  # times the time that a gateway on the way waited for it in vain
 MOST_BEHIND = 30.0  # seconds for which no probe is sent, because older ones wait at a server
 
 
@@ -121,6 +122,12 @@ class ProbePace:
         """Notes a reply to a request of this age, from a server that passes on one at a time. Its
         queue would grow with each probe. `more`: younger requests wait there."""
         self._behind_until = self.due = now + min(2 * age, MOST_BEHIND) if more else now
+
+    def absent(self, now: float, age: float) -> None:
+        """Notes that a gateway waited in vain for the reply to a request of this age. Meanwhile the
+        stations beside this one had no replies either."""
+        self._behind_until = now + min(ABSENT_PAUSE * age, MOST_BEHIND)
+        self.due = max(self.due, self._behind_until)
 
     def sent(self, *, short: bool) -> None:
         """Counts a probe that is sent."""

@@ -1,13 +1,14 @@
 """A second station with the number of a device: it replies to the same requests."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from gateway.errors import DeviceError
 
 Replied = tuple[Any, Callable[[Any], Any]]  # a reply, and what tells another reply to its request
 KEPT, LAST = 16, 6  # requests
+OTHERS = 4  # of those kept: a repeated reply may push aside the right one, which is new as well
 FOR = 600.0  # seconds
 
 
@@ -22,24 +23,29 @@ def answers_again(frame: Any, replied: Replied) -> bool:
 class Twins:
     """Learns of a second station from replies that answer the last request once more.
 
-    A device server that repeats replies sends equal ones. A second master gets replies to its own
+    A device server repeats replies that arrived before. A second master gets replies to its own
     requests. Only a second station answers most requests again, and says something else at times.
     Then a reply that came alone may be that of either.
     """
 
-    __slots__ = ("_again", "_differed", "_known", "_last")
+    __slots__ = ("_again", "_differed", "_known", "_last", "_recent")
 
     def __init__(self) -> None:
         self._last: Replied | None = None
-        self._again = deque[bool](maxlen=KEPT)  # of each request
+        self._recent = deque[object](maxlen=KEPT)  # replies to the last requests
+        # Of each request: not answered again, answered again, with a reply that had not arrived yet
+        self._again = deque[int](maxlen=KEPT)
         self._differed = self._known = -FOR
 
     def asked(self) -> None:
         """Notes a request to the device."""
-        self._again.append(False)
+        self._again.append(0)
 
-    def replied(self, last: Replied | None) -> None:
-        """Notes the last reply to it."""
+    def replied(self, last: Replied | None, before: Sequence[object] = ()) -> None:
+        """Notes the last reply to it, and those before in the same transaction."""
+        self._recent += before
+        if last is not None:
+            self._recent.append(last[0])
         self._last = last
 
     def arrived(self, frame: Any, now: float) -> None:
@@ -47,10 +53,10 @@ class Twins:
         if self._last is None or not self._again:
             return
         if answers_again(frame, self._last):
-            self._again[-1] = True
+            self._again[-1] = max(self._again[-1], 1 if frame in self._recent else 2)
             if frame != self._last[0]:
                 self._differed = now
-            if self.exist(now):
+            if self.exist(now) and self._again.count(2) >= OTHERS:
                 self._known = now
 
     def exist(self, now: float) -> bool:
@@ -58,10 +64,10 @@ class Twins:
         if now - self._differed >= FOR:
             return False
         # The right one may miss some requests. So half of the last few count as well.
-        last = [*self._again][-LAST:]
-        return 2 * sum(self._again) >= len(self._again) or 2 * sum(last) >= LAST
+        again = [answers > 0 for answers in self._again]
+        return 2 * sum(again) >= len(again) or 2 * sum(again[-LAST:]) >= LAST
 
     def may_reply(self, now: float) -> bool:
-        """Returns True if two stations answered in the last ten minutes: what a reply says may be
-        true of the other one only."""
+        """Returns True if two stations certainly answered in the last ten minutes: what a reply
+        says may be true of the other one only."""
         return now - self._known < FOR

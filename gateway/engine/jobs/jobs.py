@@ -207,6 +207,7 @@ class Traffic:
     strange: bool = False  # characters arrived that were no part of a reply
     silence: float = math.inf  # seconds before its request, the shortest of several
     replied: Replied | None = None  # the last
+    before: tuple[object, ...] = ()  # the replies before the last
     doubtful: bool = False  # a reply may be another one, or the echo of its request
 
 

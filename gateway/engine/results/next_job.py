@@ -100,7 +100,9 @@ class NextJob:
 
     def polls_ended(self, traffic: Traffic, now: float, time: int) -> None:
         """Applies the end of a transaction of polls, some of which failed."""
-        first, error = self._in_flight.failed[0]
+        (first, error), *others = self._in_flight.failed
+        for poll, _ in others:
+            poll.device.health.left_outstanding(poll.job.span, now)
         self.unclear(first.job, error, traffic, now, time)
 
     def conclude(
@@ -114,10 +116,8 @@ class NextJob:
                 self._probed(job, result, traffic, now, time)
             case Identify():
                 self._identified(job, result, traffic, now, time)
-            case Answer():
-                if isinstance(result, Garbled):
-                    why = str(result)
-                    self._effects.warning("reply dropped", device=job.device.name, why=why)
+            case Answer() if isinstance(result, Garbled):
+                self._effects.warning("reply dropped", device=job.device.name, why=str(result))
             case Write() | WriteTogether() | ReadBack() | Command() | Confirm() | Repeat():
                 self._requested(job, result, traffic, now, time)
 
@@ -127,9 +127,8 @@ class NextJob:
         device = probe.device
         self.proofs.probed(probe, result, traffic, now)
         match result:
-            case (
-                Resynced() | Refused()
-            ):  # an error reply counts too, but may belong to an older request
+            # An error reply counts too, but may belong to an older request.
+            case Resynced() | Refused():
                 told_from = _told_from(probe, result)
                 if outstanding := self._results.outstanding_requests(device):
                     outstanding += device.health.unanswered.either

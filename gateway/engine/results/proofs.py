@@ -36,7 +36,6 @@ class Proofs:
         """Holds the values of a good read."""
         device, now = read.poll.device, read.now
         self._in_flight.hold(read)
-        self._replied(device, traffic)
         if traffic.extra:
             self._results.answered_twice(device, now, read.time)
         if _may_be_alone(read.poll, traffic):
@@ -73,15 +72,9 @@ class Proofs:
         """Takes what arrived for a resync: extra replies, or a refusal of its read."""
         if traffic.extra:
             self._in_flight.doubt()
-        self._replied(probe.device, traffic)
         shapes = probe.device.shapes
         if probe.token == PROOF and isinstance(result, Refused) and shapes is not None:
             shapes.proofs.lacks(now)
-
-    @staticmethod
-    def _replied(device: Device, traffic: Traffic) -> None:
-        if device.shapes is not None:
-            device.shapes.proofs.twins.replied(traffic.replied)
 
     def resynced(self, probe: Probe, told_from: int, now: float, time: int) -> None:
         """Releases the reads that waited for this resync, if no extra reply has arrived.
@@ -123,5 +116,4 @@ def _may_be_alone(poll: PollEntry, traffic: Traffic) -> bool:
     """
     if poll.reads.owed or (traffic.doubtful and poll.device.is_doubtful):
         return True
-    late = poll.device.late_from
-    return poll.device.is_doubtful and late is not None and traffic.turnaround > late
+    return poll.device.is_doubtful and poll.device.is_unusual(traffic.turnaround)

@@ -10,7 +10,7 @@ from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.listening import listens
 from gateway.engine.results.rule import Rule
 from gateway.errors import Garbled
-from gateway.protocols.capabilities import StrayFrames, UnnumberedReplies
+from gateway.protocols.capabilities import BehindGateway, StrayFrames, UnnumberedReplies
 from gateway.protocols.driver import Codec
 
 LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level debug
@@ -87,11 +87,12 @@ class Stray(Rule):
                 self._results.spoke(each, now)
                 self._results.answered_twice(each, now, time)
 
-    @staticmethod
-    def _count_older(device: Device, frames: Sequence[Any], now: float) -> None:
+    def _count_older(self, device: Device, frames: Sequence[Any], now: float) -> None:
         """A bridge or device server works through the requests that it has kept."""
-        for _ in frames if device.driver.traits.over_network else ():
-            device.health.replied_to_older(now)
+        driver, others = device.driver, len(self._devices) > 1
+        for frame in frames if driver.traits.over_network else ():
+            absent = others and isinstance(driver, BehindGateway) and driver.is_absence(frame)
+            device.health.replied_to_older(now, absent=absent)
 
     def _log_frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
         """Logs complete frames that are already counted."""

@@ -10,6 +10,8 @@ from gateway.engine.jobs.jobs import Confirm, Poll, Probe, ReadBack, Repeat, Tra
 from gateway.engine.jobs.poll_entry import PollEntry
 from gateway.errors import DeviceError
 
+MOST_CHARGED = 10.0  # seconds of a transaction: a longer one shows that the process stood still
+
 
 class HeldRead(NamedTuple):
     """A good read whose values wait for a proof. Times of its reply."""
@@ -32,6 +34,10 @@ class InFlight:
     held: list[HeldRead] = field(default_factory=list)  # of one device; one proof is for all
     doubted: bool = False  # an extra reply arrived since the first of them
     owing: Device | None = None  # its next resync is due to a request without a reply
+
+    def stood_still(self, now: float) -> None:
+        """Charges the transaction no more than that, whatever time has passed."""
+        self.begun = now - MOST_CHARGED
 
     def follow(self, job: Transacted | PollEntry) -> None:
         """Notes the job that must follow."""

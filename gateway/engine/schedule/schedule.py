@@ -11,6 +11,7 @@ from gateway.engine.jobs.poll_entry import EXPEDITED, ON_DEMAND, BlockReads, Pol
 from gateway.engine.jobs.request_queue import RequestQueue
 from gateway.engine.jobs.requests import Command, Write
 from gateway.engine.jobs.unanswered import Unanswered
+from gateway.engine.schedule.in_flight import MOST_CHARGED
 from gateway.engine.schedule.poll_queue import PollQueue
 from gateway.engine.schedule.probe_schedule import ProbeSchedule
 from gateway.planning.planner import Block
@@ -247,7 +248,7 @@ class Schedule:
         have without a client.
         """
         if now >= self._on_demand_at:
-            took, self._on_demand_at = now - self._on_demand_at, NEVER
+            took, self._on_demand_at = min(now - self._on_demand_at, MOST_CHARGED), NEVER
             lane = max(self._on_demand_lane, now - took)
             self._on_demand_lane = lane + took / ON_DEMAND_SHARE
         if now < self._on_demand_lane or self._queue.keeps_back_on_demand:

@@ -11,7 +11,9 @@ from gateway.protocols.listening import TrafficReader
 from gateway.protocols.modbus import ascii as ascii_
 from gateway.protocols.modbus import mbap, rtu
 from gateway.protocols.modbus.addressing import Dialect, Limits
+from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.master import Master
+from gateway.protocols.modbus.pdu import is_absence
 from gateway.protocols.modbus.traffic import (
     MbapTrafficReader,
     RtuTrafficReader,
@@ -105,3 +107,6 @@ class ModbusTcp(Master):
 
     def traffic_reader(self, character: float) -> TrafficReader:
         return MbapTrafficReader()
+
+    def is_absence(self, frame: Frame) -> bool:
+        return is_absence(frame.pdu)

@@ -142,6 +142,11 @@ _NOT_DONE = (1, 2, 3, 6, 10)  # exceptions without any effect
 _UNEXECUTED = (1, 6, 10)
 
 
+def is_absence(pdu: bytes) -> bool:
+    """Returns True for the exceptions 0A and 0B: a gateway did not reach the device behind it."""
+    return len(pdu) == 2 and bool(pdu[0] & EXCEPTION) and pdu[1] in (10, _NO_RESPONSE_BEHIND)
+
+
 def raise_refusal(pdu: bytes, function: int, *, numbered: bool = False) -> None:
     """Raises the error of an exception reply to `function`; ignores other PDUs.
 
