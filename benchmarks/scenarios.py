@@ -33,7 +33,7 @@ PAGE = HERE / "docs" / "scenarios.md"
 RESULTS = HERE / "benchmarks" / "results" / "scenarios.json"
 # Seconds from the first values of all tags to the measurement. When a client connects, all values
 # are published again after 0.3 s, and after 5 s more.
-SETTLE = 9.0
+SETTLE = 15.0
 DRAIN = 1.5  # seconds after it, for what is still on its way
 PATIENCE = 180.0  # seconds for the first values
 QUIET = 0.1  # cores that other programs may use in a quiet run

@@ -344,7 +344,10 @@ class Transaction:
             own = len(request.data) if request.data in self._heard else 0  # its echo
             self.traffic.strange |= beyond - own >= SHORTEST_COMMAND
         self._heard = b""
-        self.traffic.replied, self.traffic.contradicted = (frame, request.answers), False
+        traffic = self.traffic
+        if traffic.replied is not None:
+            traffic.before += (traffic.replied[0],)
+        traffic.replied, traffic.contradicted = (frame, request.answers), False
         request.future.set_result(answer)
 
     def _takes_late(self, frame: Any) -> bool:

@@ -195,6 +195,8 @@ async def test_a_scan_has_the_documents_of_its_samples(shaping: Shaping) -> None
 
 async def test_the_loop_waits_until_many_values_are_put(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(handover, "_PATIENCE", TIMEOUT)
+    monkeypatch.setattr(handover, "SHORTEST", TIMEOUT)
+    monkeypatch.setattr(handover, "LONGEST", TIMEOUT)
     session = StuckSession()
     session.go.set()
     publisher = a_publisher()
@@ -209,7 +211,8 @@ async def test_between_two_slices_of_the_thread_the_loop_turns(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(handover, "_PATIENCE", TIMEOUT)
-    monkeypatch.setattr(handover, "SLICE", 20)
+    monkeypatch.setattr(handover, "SHORTEST", 0.0)
+    monkeypatch.setattr(handover, "LONGEST", 0.0)
     session = StuckSession()
     session.go.set()
     publisher = a_publisher()

@@ -3,7 +3,8 @@
 With many values to send the loop gives the thread slices of time, and waits meanwhile. Otherwise
 the thread gets the lock only while the loop waits for a system call, and each of its puts may wait
 for the loop: it sends less the more there is to send. A thread that hangs in a put gets no slices:
-the loop does not wait for a link that is stuck.
+the loop does not wait for a link that is stuck. The longer the loop had, the longer is a slice. So
+where both together have too much to do, the loop reads less, and what it has read goes out at once.
 """
 
 import asyncio
@@ -12,9 +13,10 @@ import time
 from collections.abc import Callable
 from math import inf
 
-SLICE = 500  # puts, which take about 2 ms; between two slices the loop turns once
+# Seconds of a slice: so many times as long as the loop had since the one before, within these ends.
+SHARE, SHORTEST, LONGEST = 2.0, 0.002, 0.008
 _MANY = 50  # waiting puts for which the loop waits
-_PATIENCE = 0.01  # seconds that the loop waits for a slice; one that takes longer hangs in a put:
+_PATIENCE = 0.02  # seconds that the loop waits for a slice; one that takes longer hangs in a put:
 _CALM = 0.1  # the loop does not wait for so many seconds
 _ALONE = 0.05  # seconds without a slice after which the thread goes on by itself
 
@@ -27,12 +29,13 @@ class Handover:
         self.lock = threading.Condition()
         self.closing = False  # the thread ends when nothing waits
         self.puts = 0  # since the start
-        self.until = inf  # the slice ends with so many puts
+        self.until = inf  # the slice ends then, by the monotonic clock
         self._waiting = waiting
         self._over = threading.Event()
         self._calm = -inf  # the loop does not wait before, by the monotonic clock,
         self._stuck_at = -1  # nor while there were so many puts
         self._comes = False  # the next slice is scheduled
+        self._ended = 0.0  # the last one
 
     # -- event loop --
 
@@ -51,8 +54,11 @@ class Handover:
             self.let_run()
             if not waits:
                 return
-            self.until = self.puts + SLICE
-        if not self._over.wait(_PATIENCE):
+            now = time.monotonic()
+            self.until = now + min(max(SHORTEST, SHARE * (now - self._ended)), LONGEST)
+        in_time = self._over.wait(_PATIENCE)
+        self._ended = time.monotonic()
+        if not in_time:
             self._calm, self._stuck_at = time.monotonic() + _CALM, self.puts
             self.until = inf
         elif self._waiting():

@@ -266,7 +266,7 @@ class Publisher:
                 now = monotonic()
                 if now - before >= losses.limit or now < losses.until:
                     losses.sent(self._values_of(key, data), now - before, now)
-                if handover.puts >= handover.until:
+                if now >= handover.until:
                     handover.give_back()
                     now = monotonic()
                 before = now
