@@ -433,7 +433,8 @@ def test_while_the_process_stood_still_no_probe_is_charged() -> None:
     schedule = Schedule([healthy, lost], 0.0)
     fail(lost)
     schedule.went_offline(lost, 0.0, 3600.0)
-    assert schedule.reachable(lost, probe_seconds(lost) / OFFLINE_SHARE + PROBE_PAUSE)
+    charged = probe_seconds(lost) + lost.longest_reply
+    assert schedule.reachable(lost, charged / OFFLINE_SHARE + PROBE_PAUSE)
 
 
 def test_one_offline_unit_of_a_network_gets_less_than_all_together() -> None:

@@ -135,9 +135,8 @@ class ProbeSchedule:
             return
         if self._in_idle_time:
             return
-        took = min(
-            took, probe_seconds(device)
-        )  # several polls were lost, or the process stood still
+        # Several polls were lost, or the process stood still.
+        took = min(took, probe_seconds(device) + device.longest_reply)
         silent = [other.health.state for other in self._devices].count(State.OFFLINE)
         share = offline_share(silent, over_network=device.driver.traits.over_network)
         self._offline_lane = now + took * (1 / share - 1) if self._any_online else now
