@@ -9,7 +9,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.device.health import Health, State, diagnosis
 from gateway.engine.device.identity import Identity
 from gateway.engine.device.monitor_list import MonitorList
-from gateway.engine.device.records import LATE, SLOWER, Record
+from gateway.engine.device.records import Record, late_from
 from gateway.engine.device.reply_shapes import MOST_HELD, GoodReads, ReplyShapes, reply_shapes
 from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.device.turnaround import Turnaround
@@ -132,13 +132,13 @@ class Device:
     def late_from(self) -> float | None:
         """Seconds of the station after which a reply is later than usual; None: not known yet."""
         usual = self.usual_turnaround
-        return None if usual is None else max(LATE, SLOWER * usual)
+        return None if usual is None else late_from(usual)
 
     def is_unusual(self, turnaround: float) -> bool:
         """Returns True if it is longer than most. A few that another master delayed make no more
         of them usual."""
         usual = self._usual(self.record.replies.typical)
-        return usual is not None and turnaround > max(LATE, SLOWER * usual)
+        return usual is not None and turnaround > late_from(usual)
 
     def may_be_echo(self, turnaround: float, unproven: float) -> bool:
         """Returns True if a reply that equals its request may be its echo, although the adapter

@@ -14,7 +14,7 @@ LATELY = 32  # requests whose ends are kept
 QUICKEST_OF = 50  # exchanges
 FASTER = 0.03  # by which the clock of a station may be fast
 # A reply is late from so many seconds on, at least, and from so many times the usual turnaround
-LATE, SLOWER = 0.02, 3.0
+_LATE, _SLOWER = 0.02, 3.0
 SOONER = 0.002  # seconds, at least, by which a reply comes sooner than the station can reply
 MOST_RESULTS = 20  # a modem that says noise does not fill the memory
 
@@ -194,7 +194,7 @@ class Replies:
     """The turnarounds of one station. Seconds."""
 
     turnaround: float | None = None  # smoothed over about ten exchanges
-    typical: float | None = None  # the same, but each counts as `SLOWER` times it at most
+    typical: float | None = None  # the same, but each counts as late at most
     quickest: float = math.inf  # of many recent exchanges
     soonest: float = -math.inf  # a reply that comes sooner may be another one
     # Replies come before their characters can be over, by this share of their time; <= 0
@@ -209,7 +209,7 @@ class Replies:
         known = self.turnaround
         self.turnaround = own if known is None else known + 0.1 * (own - known)
         typical = own if self.typical is None else self.typical
-        self.typical = typical + 0.1 * (min(own, max(LATE, SLOWER * typical)) - typical)
+        self.typical = typical + 0.1 * (min(own, late_from(typical)) - typical)
         if ahead < -FASTER:
             self._early += 1
             self._ahead_now = min(self._ahead_now, ahead)
@@ -237,6 +237,11 @@ class Replies:
         if self.soonest > 0.0:
             return own < self.soonest
         return own < min(self.soonest, (self._ahead - FASTER) * busy)
+
+
+def late_from(usual: float) -> float:
+    """Returns the turnaround above which a reply is late."""
+    return max(_LATE, _SLOWER * usual)
 
 
 def _soonest(quickest: float) -> float:
